@@ -1,0 +1,50 @@
+"""How it is found: the protocol of a method, and one file a method."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from systems.errors import InputError, unknown
+from systems.lattice import load_module
+
+if TYPE_CHECKING:
+    from methods.method import Method
+
+
+def registered() -> dict[str, type[Method]]:
+    """Give every method of this package by its name: what the modules list in `METHODS`."""
+    found: dict[str, type[Method]] = {}
+    for info in pkgutil.iter_modules(__path__):
+        module = importlib.import_module(f"{__name__}.{info.name}")
+        found.update({kind.name: kind for kind in getattr(module, "METHODS", ())})
+    return dict(sorted(found.items()))
+
+
+def find(name: str, base: Path | None = None) -> type[Method]:
+    """Look a method up by its name, or in a user's file: `FILE.py` or, where it has several, `FILE.py:NAME`.
+
+    Args:
+        name: a name from `registered()`, or the path of a Python file that defines `METHODS`.
+        base: the folder that a relative path starts from; the working directory when None.
+
+    Raises:
+        InputError: there is no such method or file.
+    """
+    path, _, wanted = name.rpartition(":") if ".py:" in name else (name, "", "")
+    if path.endswith(".py"):
+        full = (base or Path()) / path
+        kinds = {kind.name: kind for kind in getattr(load_module(full), "METHODS", ())}
+        if not kinds:
+            raise InputError(f"{full}: it must define METHODS = (YourMethod,)")
+        if not wanted and len(kinds) > 1:
+            raise InputError(f"{full}: it has several methods; choose one as {path}:{sorted(kinds)[0]}")
+        if wanted and wanted not in kinds:
+            raise unknown("method", wanted, kinds, str(full))
+        return kinds[wanted or next(iter(kinds))]
+    known = registered()
+    if name not in known:
+        raise InputError(f"{unknown('method', name, known)} (or the path of a .py file)")
+    return known[name]

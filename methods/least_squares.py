@@ -1,0 +1,42 @@
+"""Dense least squares on differentiated samples: the floor that every sparse method must beat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from methods.derivatives import takes
+from methods.method import Abilities, Fit
+from methods.regression import rows
+from systems.lattice import Library
+from systems.samples import Samples
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """Least squares on differentiated samples, no term dropped.
+
+    Attributes:
+        differentiation: see `methods.derivatives`.
+        options: further arguments for pysindy's ways of differentiating.
+    """
+
+    name: ClassVar[str] = "least-squares"
+    differentiation: str = "smoothing-spline"
+    options: dict[str, Any] | None = None
+
+    @property
+    def abilities(self) -> Abilities:
+        """As far as the differentiation goes."""
+        uneven, missing = takes(self.differentiation)
+        return Abilities(uneven=uneven, missing=missing)
+
+    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:  # noqa: ARG002
+        """Minimise |y - A xi|^2."""
+        regression = rows(data, library, order, self.differentiation, self.options)
+        coefficients = regression.least_squares()
+        return Fit(self.name, library, order, coefficients, regression.residual(coefficients))
+
+
+METHODS = (LeastSquares,)

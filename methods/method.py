@@ -1,0 +1,208 @@
+"""The protocol of a method, what it can do, and the fit that it gives.
+
+A method is a frozen dataclass whose fields are its settings, with a `name`, `abilities` and
+
+    fit(data, library, order, seed) -> Fit
+
+`data` is a list of trajectories, `library` the candidate terms T_j, `order` the order of the time derivative. The fit is the
+real coefficients xi of
+
+    d^order u_n / dt^order = sum_j xi_j T_j(u_{n+k}, v_{n+k}, f_n, n, t)
+
+Heavy packages (torch, pysindy) are imported where they are used, so that listing methods stays fast.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_type_hints
+
+import numpy as np
+
+from systems.errors import InputError, unknown
+from systems.lattice import Library, ghosts
+from systems.samples import Samples, SimulatedSamples
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+
+@dataclass(frozen=True)
+class Abilities:
+    """What a method can take; the runner skips it, with a reason, where the data ask for more.
+
+    Attributes:
+        complex: complex fields.
+        inputs: measured inputs f.
+        uneven: times that are not evenly spaced.
+        missing: values that are NaN.
+        truth: it must be shown the truth (a ceiling, not a contestant).
+    """
+
+    complex: bool = True
+    inputs: bool = True
+    uneven: bool = True
+    missing: bool = False
+    truth: bool = False
+
+
+class Skipped(Exception):
+    """A method cannot take these data; the text is the reason."""
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """How the coefficients came about.
+
+    Attributes:
+        step: optimiser steps (K,), increasing.
+        seconds: wall time since the start of the fit (K,).
+        loss: the objective (K,), of the method's own units.
+        coefficients: (K, terms).
+    """
+
+    step: Float[ndarray, " record"]
+    seconds: Float[ndarray, " record"]
+    loss: Float[ndarray, " record"]
+    coefficients: Float[ndarray, "record terms"]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Coefficients, and how they were had.
+
+    Attributes:
+        method: the method's name.
+        library: the terms, in the order of the coefficients.
+        order: the order of the time derivative.
+        coefficients: one real number a term, in the units of the derivative over those of the term.
+        residual: RMS of what the equation leaves of the derivative, over the RMS of the derivative (dimensionless);
+            NaN where the method has no derivative.
+        stderr: standard errors, or None where the method gives none.
+        status: "ok", or what to know about the fit.
+        seconds, cpu_seconds: wall and processor time of the fit alone.
+        history: the way there, where there was one.
+        found: what the method found on its way (a threshold, a weight), by name.
+
+    Raises:
+        ValueError: the coefficients do not match the library.
+    """
+
+    method: str
+    library: Library
+    order: int
+    coefficients: Float[ndarray, " terms"]
+    residual: float
+    stderr: Float[ndarray, " terms"] | None = None
+    status: str = "ok"
+    seconds: float = float("nan")
+    cpu_seconds: float = float("nan")
+    history: History | None = None
+    found: Mapping[str, float | str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check that there is one coefficient a term."""
+        expected = (len(self.library.terms),)
+        for name, array in (("coefficients", self.coefficients), ("stderr", self.stderr)):
+            if array is not None and np.shape(array) != expected:
+                raise ValueError(f"{self.method}: {name} have shape {np.shape(array)}, the library {expected}")
+
+
+class Method(Protocol):
+    """What every method offers; a frozen dataclass whose fields are its settings."""
+
+    name: ClassVar[str]
+
+    @property
+    def abilities(self) -> Abilities:
+        """What the method can take with these settings."""
+        ...
+
+    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
+        """Fit the coefficients; every random draw comes from a generator seeded with `seed`."""
+        ...
+
+
+def make(kind: type[Method], settings: Mapping[str, Any], where: str = "") -> Method:
+    """Make a method with settings, given as values or as texts from a command line.
+
+    Raises:
+        InputError: a setting that the method does not have, or a value of another type.
+    """
+    import pydantic
+
+    known = {one.name: one for one in fields(kind)} if hasattr(kind, "__dataclass_fields__") else {}
+    hints = get_type_hints(kind)
+    values = {}
+    place = f"{where}: " if where else ""
+    for name, given in settings.items():
+        if name not in known:
+            raise unknown("setting", name, known, f"{place}method {kind.name!r}")
+        try:
+            adapter: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(hints[name])
+            if isinstance(given, str) and given[:1] in "[{" and given:
+                values[name] = adapter.validate_json(given)
+            else:
+                values[name] = adapter.validate_python(given)
+        except pydantic.ValidationError as error:
+            reason = error.errors()[0]["msg"]
+            raise InputError(f"{place}method {kind.name!r}: setting {name} = {given!r}: {reason}") from None
+    return kind(**values)
+
+
+def settings(kind: type[Method]) -> dict[str, Any]:
+    """Give a method's settings with their defaults."""
+    instance = kind()
+    return {one.name: getattr(instance, one.name) for one in fields(kind)} if hasattr(kind, "__dataclass_fields__") else {}
+
+
+def solve(method: Method, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
+    """Check that a method can take the data, hide the truth from it, and time its fit.
+
+    Raises:
+        Skipped: the method declares that it cannot take these data.
+        InputError: the library cannot be evaluated on the data.
+    """
+    check_fit(data, library, order)
+    reason = obstacle(method.abilities, data, library)
+    if reason:
+        raise Skipped(reason)
+    shown = [s.observed() if isinstance(s, SimulatedSamples) and not method.abilities.truth else s for s in data]
+    wall, cpu = time.perf_counter(), time.process_time()
+    fit = method.fit(shown, library, order, seed)
+    return replace(fit, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
+
+
+def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:
+    """Check that a library makes sense on data.
+
+    Raises:
+        InputError: wrong order, a complex term on a real field, a missing input, or fewer sites than the stencil needs.
+    """
+    if order not in (1, 2):
+        raise InputError(f"order is {order!r}; it must be 1 (du/dt) or 2 (d^2u/dt^2)")
+    if not data:
+        raise InputError("there are no samples to fit")
+    for samples in data:
+        ghosts(samples.sites, *library.reach, samples.ends)
+        if library.uses("f") and samples.f is None:
+            raise InputError(f"{samples.source}: the library uses f[n], but the data have no measured input f or f1..f{samples.sites}")
+        if library.uses("i") and not samples.is_complex:
+            raise InputError(f"{samples.source}: the library uses i, but the field is real; leave the terms with i out")
+    if library.uses("v") and order == 1:
+        raise InputError("the library uses v[n], but an equation of order 1 has no velocity; use --order 2")
+
+
+def obstacle(abilities: Abilities, data: Sequence[Samples], library: Library) -> str:
+    """Say why a method cannot take the data; empty when it can."""
+    checks: list[tuple[bool, Callable[[Samples], bool], str]] = [
+        (abilities.complex, lambda s: s.is_complex, "it does not take complex fields"),
+        (abilities.inputs, lambda s: s.f is not None and library.uses("f"), "it does not take measured inputs"),
+        (abilities.uneven, lambda s: not s.is_even, "it needs evenly spaced times"),
+        (abilities.missing, lambda s: s.has_missing, "it does not take missing values"),
+        (not abilities.truth, lambda s: not isinstance(s, SimulatedSamples), "it needs the truth, which only simulated samples know"),
+    ]
+    return next((reason for able, asks, reason in checks if not able and any(asks(s) for s in data)), "")

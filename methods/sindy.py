@@ -1,0 +1,165 @@
+"""Sparse regression with pysindy's optimisers on differentiated samples.
+
+`stlsq`: sequentially thresholded least squares (Brunton, Proctor & Kutz, PNAS 113, 3932 (2016)); `sr3`: sparse relaxed
+regularised regression (Zheng et al., IEEE Access 7, 1404 (2019)), debiased on its support as STLSQ is; `pysindy`: any other
+of pysindy's optimisers by its name.
+
+Rows are scaled by the RMS of the derivative and columns by the RMS of their term, so that a threshold is a share: a term
+below `threshold` times the derivative's RMS is dropped, whatever the units and the number of samples.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from methods.derivatives import takes
+from methods.method import Abilities, Fit
+from methods.regression import Regression, rows
+from systems.errors import InputError, unknown
+from systems.lattice import Library
+from systems.samples import Samples
+
+
+def sparse_fit(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> np.ndarray:
+    """Fit scaled rows with one of pysindy's optimisers, made afresh, and give the coefficients in the data's units.
+
+    Raises:
+        InputError: there is no such optimiser, or it refuses its arguments.
+    """
+    import pysindy.optimizers
+    from pysindy.optimizers import BaseOptimizer
+
+    known = {
+        name for name, kind in vars(pysindy.optimizers).items()
+        if isinstance(kind, type) and issubclass(kind, BaseOptimizer) and kind is not BaseOptimizer
+    }  # fmt: skip
+    if optimizer not in known:
+        raise unknown("pysindy optimiser", optimizer, known)
+    scale = regression.scales
+    height = np.sqrt(np.mean(regression.target**2)) or 1.0
+    # Bagging draws from NumPy's global generator (pysindy 2.1), so it is seeded here and put back.
+    state = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed % 2**32)  # noqa: NPY002
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            fitted = getattr(pysindy.optimizers, optimizer)(**arguments).fit(
+                regression.design / (scale * height), regression.target[:, None] / height
+            )
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"pysindy's {optimizer} with {dict(arguments)}: {error}") from error
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+    return np.asarray(fitted.coef_)[0] / scale
+
+
+@dataclass(frozen=True)
+class STLSQ:
+    """pysindy's STLSQ.
+
+    Attributes:
+        threshold: share of the derivative's RMS below which a term is dropped (dimensionless).
+        alpha: ridge penalty; 0, because pysindy's default of 0.05 biases the selection.
+        max_iter: most rounds of thresholding.
+        differentiation, options: see `methods.derivatives`.
+    """
+
+    name: ClassVar[str] = "stlsq"
+    threshold: float = 0.05
+    alpha: float = 0.0
+    max_iter: int = 20
+    differentiation: str = "smoothing-spline"
+    options: dict[str, Any] | None = None
+
+    @property
+    def abilities(self) -> Abilities:
+        """As far as the differentiation goes."""
+        uneven, missing = takes(self.differentiation)
+        return Abilities(uneven=uneven, missing=missing)
+
+    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
+        """Threshold and refit until the support stays."""
+        regression = rows(data, library, order, self.differentiation, self.options)
+        arguments = {"threshold": self.threshold, "alpha": self.alpha, "max_iter": self.max_iter}
+        return _fit(self.name, "STLSQ", arguments, regression, library, order, seed)
+
+
+@dataclass(frozen=True)
+class SR3:
+    """pysindy's SR3, with the coefficients refitted on the support it finds.
+
+    Attributes:
+        regularizer: the penalty: L0, L1 or L2.
+        reg_weight_lam: its weight; with L0 and a relaxation of 1 a term below sqrt(2 lam) of the derivative's RMS is dropped.
+        relax_coeff_nu: the relaxation.
+        max_iter, tol: when to stop.
+        differentiation, options: see `methods.derivatives`.
+    """
+
+    name: ClassVar[str] = "sr3"
+    regularizer: str = "L0"
+    reg_weight_lam: float = 0.00125
+    relax_coeff_nu: float = 1.0
+    max_iter: int = 1000
+    tol: float = 1e-8
+    differentiation: str = "smoothing-spline"
+    options: dict[str, Any] | None = None
+
+    @property
+    def abilities(self) -> Abilities:
+        """As far as the differentiation goes."""
+        uneven, missing = takes(self.differentiation)
+        return Abilities(uneven=uneven, missing=missing)
+
+    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
+        """Minimise the relaxed objective, then refit on the support."""
+        regression = rows(data, library, order, self.differentiation, self.options)
+        arguments = {
+            "regularizer": self.regularizer, "reg_weight_lam": self.reg_weight_lam,
+            "relax_coeff_nu": self.relax_coeff_nu, "max_iter": self.max_iter, "tol": self.tol, "unbias": True,
+        }  # fmt: skip
+        return _fit(self.name, "SR3", arguments, regression, library, order, seed)
+
+
+@dataclass(frozen=True)
+class PySINDy:
+    """Any of pysindy's optimisers.
+
+    Attributes:
+        optimizer: its class name, such as SSR, FROLS or MIOSR.
+        arguments: its arguments, as a table.
+        differentiation, options: see `methods.derivatives`.
+    """
+
+    name: ClassVar[str] = "pysindy"
+    optimizer: str = "FROLS"
+    arguments: dict[str, Any] | None = None
+    differentiation: str = "smoothing-spline"
+    options: dict[str, Any] | None = None
+
+    @property
+    def abilities(self) -> Abilities:
+        """As far as the differentiation goes."""
+        uneven, missing = takes(self.differentiation)
+        return Abilities(uneven=uneven, missing=missing)
+
+    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
+        """Hand the scaled rows to the optimiser."""
+        regression = rows(data, library, order, self.differentiation, self.options)
+        return _fit(self.name, self.optimizer, self.arguments or {}, regression, library, order, seed)
+
+
+def _fit(
+    name: str, optimizer: str, arguments: Mapping[str, Any], regression: Regression, library: Library, order: int, seed: int
+) -> Fit:
+    coefficients = sparse_fit(regression, optimizer, arguments, seed)
+    status = "ok" if np.any(coefficients) else "every term was dropped; lower the threshold"
+    return Fit(name, library, order, coefficients, regression.residual(coefficients), status=status)
+
+
+METHODS = (STLSQ, SR3, PySINDy)

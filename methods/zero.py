@@ -1,0 +1,32 @@
+"""The zero model: every coefficient 0. What a method must beat to have found anything."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from methods.method import Abilities, Fit
+from systems.lattice import Library
+from systems.samples import Samples
+
+
+@dataclass(frozen=True)
+class Zero:
+    """Says that nothing moves."""
+
+    name: ClassVar[str] = "zero"
+
+    @property
+    def abilities(self) -> Abilities:
+        """Anything goes."""
+        return Abilities(missing=True)
+
+    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:  # noqa: ARG002
+        """Give zeros; the whole derivative is left."""
+        return Fit(self.name, library, order, np.zeros(len(library.terms)), residual=1.0)
+
+
+METHODS = (Zero,)

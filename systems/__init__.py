@@ -1,0 +1,44 @@
+"""What is studied: terms, lattices, samples, simulation, and one file a system."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from systems.errors import InputError, unknown
+
+if TYPE_CHECKING:
+    from systems.lattice import System
+
+
+def names() -> list[str]:
+    """Name every system of this package: each module that has a `SYSTEM`."""
+    return sorted(
+        module.SYSTEM.name
+        for info in pkgutil.iter_modules(__path__)
+        if hasattr(module := importlib.import_module(f"{__name__}.{info.name}"), "SYSTEM")
+    )
+
+
+def find(name: str, base: Path | None = None) -> System:
+    """Look a system up by its name, or load it from a user's `.py` or `.toml` file.
+
+    Args:
+        name: a name from `names()`, or the path of a file.
+        base: the folder that a relative path starts from; the working directory when None.
+
+    Raises:
+        InputError: there is no such system or file, or the file does not hold a sound system.
+    """
+    from systems.lattice import load
+
+    if name.endswith((".py", ".toml")):
+        return load((base or Path()) / name)
+    for info in pkgutil.iter_modules(__path__):
+        system = getattr(importlib.import_module(f"{__name__}.{info.name}"), "SYSTEM", None)
+        if system is not None and system.name == name:
+            return system  # type: ignore[no-any-return]
+    error = unknown("system", name, names())
+    raise InputError(f"{error} (or the path of a .py or .toml file)")
