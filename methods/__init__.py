@@ -36,7 +36,7 @@ def find(name: str, base: Path | None = None) -> type[Method]:
     path, _, wanted = name.rpartition(":") if ".py:" in name else (name, "", "")
     if path.endswith(".py"):
         full = (base or Path()) / path
-        kinds = {kind.name: kind for kind in getattr(load_module(full), "METHODS", ())}
+        kinds: dict[str, type[Method]] = {kind.name: kind for kind in getattr(load_module(full), "METHODS", ())}
         if not kinds:
             raise InputError(f"{full}: it must define METHODS = (YourMethod,)")
         if not wanted and len(kinds) > 1:

@@ -24,7 +24,16 @@ DEGREE = 5
 # A dense eigenvalue problem of this size takes about a second.
 MAX_COEFFICIENTS = 1000
 # Of the derivative package's kinds; trend_filtered, spectral, kalman, rbf and savitzky_golay need their options.
-KINDS = ("finite_difference", "kalman", "kernel", "rbf", "savitzky_golay", "spectral", "spline", "trend_filtered")
+KINDS = (
+    "finite_difference",
+    "kalman",
+    "kernel",
+    "rbf",
+    "savitzky_golay",
+    "spectral",
+    "spline",
+    "trend_filtered",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +51,10 @@ def takes(kind: str) -> tuple[bool, bool]:
 
 
 def differentiate(
-    t: Float[ndarray, " time"], field: Float[ndarray, "time sites"], kind: str, options: Mapping[str, Any] | None = None
+    t: Float[ndarray, " time"],
+    field: Float[ndarray, "time sites"],
+    kind: str,
+    options: Mapping[str, Any] | None = None,
 ) -> Smoothed:
     """Differentiate each site's series twice.
 
@@ -58,7 +70,9 @@ def differentiate(
     if np.iscomplexobj(field):
         real, imaginary = (differentiate(t, part, kind, options) for part in (field.real, field.imag))
         return Smoothed(
-            real.value + 1j * imaginary.value, real.first + 1j * imaginary.first, real.second + 1j * imaginary.second
+            real.value + 1j * imaginary.value,
+            real.first + 1j * imaginary.first,
+            real.second + 1j * imaginary.second,
         )
     if kind not in ("smoothing-spline", "spline"):
         return _pysindy(t, field, kind, options or {})
@@ -73,7 +87,11 @@ def differentiate(
         if np.sum(seen) <= DEGREE:
             continue
         one = _spline(t[seen], field[seen, site : site + 1], smooth=kind == "smoothing-spline")
-        for target, source in ((result.value, one.value), (result.first, one.first), (result.second, one.second)):
+        for target, source in (
+            (result.value, one.value),
+            (result.first, one.first),
+            (result.second, one.second),
+        ):
             target[seen, site] = source[:, 0]
     return result
 
@@ -82,7 +100,9 @@ def _spline(t: ndarray, field: ndarray, *, smooth: bool) -> Smoothed:
     from scipy.interpolate import BSpline, make_interp_spline
 
     if len(t) <= DEGREE:
-        raise InputError(f"a quintic spline needs at least {DEGREE + 1} samples, there are {len(t)}; use FiniteDifference")
+        raise InputError(
+            f"a quintic spline needs at least {DEGREE + 1} samples, there are {len(t)}; use FiniteDifference"
+        )
     # The fit lives on [0, 1], so that the penalty's size does not depend on the unit of time.
     span = t[-1] - t[0]
     x = (t - t[0]) / span
@@ -154,7 +174,11 @@ def _pysindy(t: ndarray, field: ndarray, kind: str, options: Mapping[str, Any]) 
         make = pysindy.SINDyDerivative
         options = {"kind": kind, **options}
     else:
-        raise unknown("differentiation", kind, ["smoothing-spline", "spline", "FiniteDifference", "SmoothedFiniteDifference", *KINDS])
+        raise unknown(
+            "differentiation",
+            kind,
+            ["smoothing-spline", "spline", "FiniteDifference", "SmoothedFiniteDifference", *KINDS],
+        )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_type_hints
 
 import numpy as np
@@ -126,7 +126,7 @@ class Method(Protocol):
         ...
 
 
-def make(kind: type[Method], settings: Mapping[str, Any], where: str = "") -> Method:
+def make(kind: type[Method], given: Mapping[str, Any], where: str = "") -> Method:
     """Make a method with settings, given as values or as texts from a command line.
 
     Raises:
@@ -134,29 +134,29 @@ def make(kind: type[Method], settings: Mapping[str, Any], where: str = "") -> Me
     """
     import pydantic
 
-    known = {one.name: one for one in fields(kind)} if hasattr(kind, "__dataclass_fields__") else {}
+    known = settings(kind)
     hints = get_type_hints(kind)
     values = {}
     place = f"{where}: " if where else ""
-    for name, given in settings.items():
+    for name, value in given.items():
         if name not in known:
             raise unknown("setting", name, known, f"{place}method {kind.name!r}")
         try:
             adapter: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(hints[name])
-            if isinstance(given, str) and given[:1] in "[{" and given:
-                values[name] = adapter.validate_json(given)
+            if isinstance(value, str) and value.startswith(("[", "{")):
+                values[name] = adapter.validate_json(value)
             else:
-                values[name] = adapter.validate_python(given)
+                values[name] = adapter.validate_python(value)
         except pydantic.ValidationError as error:
             reason = error.errors()[0]["msg"]
-            raise InputError(f"{place}method {kind.name!r}: setting {name} = {given!r}: {reason}") from None
+            raise InputError(f"{place}method {kind.name!r}: setting {name} = {value!r}: {reason}") from None
     return kind(**values)
 
 
 def settings(kind: type[Method]) -> dict[str, Any]:
     """Give a method's settings with their defaults."""
-    instance = kind()
-    return {one.name: getattr(instance, one.name) for one in fields(kind)} if hasattr(kind, "__dataclass_fields__") else {}
+    instance: Any = kind()
+    return {one.name: getattr(instance, one.name) for one in fields(instance)} if is_dataclass(instance) else {}
 
 
 def solve(method: Method, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
@@ -189,7 +189,9 @@ def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:
     for samples in data:
         ghosts(samples.sites, *library.reach, samples.ends)
         if library.uses("f") and samples.f is None:
-            raise InputError(f"{samples.source}: the library uses f[n], but the data have no measured input f or f1..f{samples.sites}")
+            raise InputError(
+                f"{samples.source}: the library uses f[n], but the data have no measured input f or f1..f{samples.sites}"
+            )
         if library.uses("i") and not samples.is_complex:
             raise InputError(f"{samples.source}: the library uses i, but the field is real; leave the terms with i out")
     if library.uses("v") and order == 1:
@@ -200,9 +202,17 @@ def obstacle(abilities: Abilities, data: Sequence[Samples], library: Library) ->
     """Say why a method cannot take the data; empty when it can."""
     checks: list[tuple[bool, Callable[[Samples], bool], str]] = [
         (abilities.complex, lambda s: s.is_complex, "it does not take complex fields"),
-        (abilities.inputs, lambda s: s.f is not None and library.uses("f"), "it does not take measured inputs"),
+        (
+            abilities.inputs,
+            lambda s: s.f is not None and library.uses("f"),
+            "it does not take measured inputs",
+        ),
         (abilities.uneven, lambda s: not s.is_even, "it needs evenly spaced times"),
         (abilities.missing, lambda s: s.has_missing, "it does not take missing values"),
-        (not abilities.truth, lambda s: not isinstance(s, SimulatedSamples), "it needs the truth, which only simulated samples know"),
+        (
+            not abilities.truth,
+            lambda s: not isinstance(s, SimulatedSamples),
+            "it needs the truth, which only simulated samples know",
+        ),
     ]
     return next((reason for able, asks, reason in checks if not able and any(asks(s) for s in data)), "")

@@ -52,7 +52,8 @@ class Oracle:
                 assert samples.rate is not None
                 parts.append(assemble(samples, library, samples.exact.u, samples.exact.v, samples.rate))
             regression = Regression(
-                np.concatenate([part.design for part in parts]), np.concatenate([part.target for part in parts])
+                np.concatenate([part.design for part in parts]),
+                np.concatenate([part.target for part in parts]),
             )
         else:
             regression = rows(data, library, order, "smoothing-spline")

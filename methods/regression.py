@@ -59,7 +59,11 @@ class Regression:
 
 
 def rows(
-    data: Sequence[Samples], library: Library, order: int, differentiation: str, options: Mapping[str, Any] | None = None
+    data: Sequence[Samples],
+    library: Library,
+    order: int,
+    differentiation: str,
+    options: Mapping[str, Any] | None = None,
 ) -> Regression:
     """Differentiate the samples and evaluate the library on them.
 
@@ -83,7 +87,9 @@ def rows(
         targets.append(one.target)
     design, target = np.concatenate(designs), np.concatenate(targets)
     if len(target) == 0:
-        raise InputError(f"{data[0].source}: no sample has its whole stencil; there are too many missing values or too few sites")
+        raise InputError(
+            f"{data[0].source}: no sample has its whole stencil; there are too many missing values or too few sites"
+        )
     return Regression(design, target)
 
 

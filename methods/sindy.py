@@ -55,7 +55,8 @@ def sparse_fit(regression: Regression, optimizer: str, arguments: Mapping[str, A
         raise InputError(f"pysindy's {optimizer} with {dict(arguments)}: {error}") from error
     finally:
         np.random.set_state(state)  # noqa: NPY002
-    return np.asarray(fitted.coef_)[0] / scale
+    coefficients: np.ndarray = np.asarray(fitted.coef_)[0] / scale
+    return coefficients
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,13 @@ class PySINDy:
 
 
 def _fit(
-    name: str, optimizer: str, arguments: Mapping[str, Any], regression: Regression, library: Library, order: int, seed: int
+    name: str,
+    optimizer: str,
+    arguments: Mapping[str, Any],
+    regression: Regression,
+    library: Library,
+    order: int,
+    seed: int,
 ) -> Fit:
     coefficients = sparse_fit(regression, optimizer, arguments, seed)
     status = "ok" if np.any(coefficients) else "every term was dropped; lower the threshold"

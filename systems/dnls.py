@@ -16,16 +16,19 @@ TEN = (
     f"{NEIGHBOURS}; abs(u[n])**2; u[n]**2; conj(u[n])**2; (u[n+1]+u[n-1])/2*u[n]; "
     "abs(u[n])**2*(u[n+1]+u[n-1]); u[n]*(abs(u[n+1])**2+abs(u[n-1])**2)"
 )
-NINE = (
-    f"{NEIGHBOURS}; abs(u[n])**2; abs(u[n+1])**2; abs(u[n-1])**2; abs(u[n+1])**2*u[n+1]; abs(u[n-1])**2*u[n-1]"
-)
+NINE = f"{NEIGHBOURS}; abs(u[n])**2; abs(u[n+1])**2; abs(u[n-1])**2; abs(u[n+1])**2*u[n+1]; abs(u[n-1])**2*u[n-1]"
 
 # The Ginzburg-Landau lattice has the same ones.
 LIBRARIES = (
     library("four", NEIGHBOURS, "paper, four complex terms", with_imaginary=True),
     library("ten", TEN, "paper, ten complex terms", with_imaginary=True),
     library("nine", NINE, "paper, nine complex terms", with_imaginary=True),
-    library("four-next", f"{NEIGHBOURS}; u[n+2]; u[n-2]", "paper, with next-to-next neighbours", with_imaginary=True),
+    library(
+        "four-next",
+        f"{NEIGHBOURS}; u[n+2]; u[n-2]",
+        "paper, with next-to-next neighbours",
+        with_imaginary=True,
+    ),
 )
 
 SYSTEM = System(
@@ -38,7 +41,11 @@ SYSTEM = System(
     initials={"gauss": Initial(u="exp(-x**2)")},
     libraries=(
         *LIBRARIES,
-        library("equation", "i*(u[n+1]+u[n-1]-2*u[n]); i*abs(u[n])**2*u[n]", "the equation's own terms, conservative"),
+        library(
+            "equation",
+            "i*(u[n+1]+u[n-1]-2*u[n]); i*abs(u[n])**2*u[n]",
+            "the equation's own terms, conservative",
+        ),
     ),
     source="the paper, equation (2), Table 1",
     half_length="N/(2*sqrt(C))",

@@ -435,7 +435,7 @@ class Motion:
             values = bundle.function(*gather(t, y))
             data = np.concatenate([np.broadcast_to(value, sites) * w for value, w in zip(values, weights, strict=True)])
             place = (np.concatenate(rows), np.concatenate(columns))
-            return identity + scipy.sparse.csc_array((data, place), shape=shape)
+            return scipy.sparse.csc_array(identity + scipy.sparse.csc_array((data, place), shape=shape))
 
         return derivative
 
@@ -447,7 +447,9 @@ class Motion:
         sites, parts = self.sites, self.parts
         for slot in slots:
             if slot.name == "f":
-                raise InputError("an equation with a measured input f[n] cannot be simulated; write the force as a function of t")
+                raise InputError(
+                    "an equation with a measured input f[n] cannot be simulated; write the force as a function of t"
+                )
 
         def windows(t: float, y: ndarray) -> list[Any]:
             padded = y.reshape(self.order, parts, sites)[:, :, index] * factor
@@ -525,7 +527,17 @@ def _from_toml(path: Path) -> System:
     from systems.toml import read_toml
 
     content = read_toml(path)
-    fields = ("name", "title", "equation", "order", "complex", "parameters", "initials", "libraries", "source")
+    fields = (
+        "name",
+        "title",
+        "equation",
+        "order",
+        "complex",
+        "parameters",
+        "initials",
+        "libraries",
+        "source",
+    )
     optional = ("half_length", "sites", "ends", "integrator", "notes")
     for key in content:
         if key not in (*fields, *optional):

@@ -63,7 +63,9 @@ class Samples:
             raise InputError(f"{where}: it has no sites; give columns u1, u2, ...")
         if not np.all(np.isfinite(self.t)):
             row = int(np.flatnonzero(~np.isfinite(self.t))[0])
-            raise InputError(f"{where}: row {row + 1}, column t: the time is missing or not finite; fill it in or leave the row out")
+            raise InputError(
+                f"{where}: row {row + 1}, column t: the time is missing or not finite; fill it in or leave the row out"
+            )
         steps = np.diff(self.t)
         if np.any(steps <= 0):
             row = int(np.flatnonzero(steps <= 0)[0]) + 1
@@ -81,7 +83,9 @@ class Samples:
                 )
             if np.any(np.isinf(array)):
                 row, site = (int(k) for k in np.argwhere(np.isinf(array))[0])
-                raise InputError(f"{where}: row {row + 1}, column {name}{site + 1}: infinite; leave the cell empty if it is missing")
+                raise InputError(
+                    f"{where}: row {row + 1}, column {name}{site + 1}: infinite; leave the cell empty if it is missing"
+                )
         if np.all(np.isnan(self.u)):
             raise InputError(f"{where}: every value of u is missing")
         if self.sigma is not None and not (np.isfinite(self.sigma) and self.sigma >= 0):
@@ -112,9 +116,7 @@ class Samples:
 
     def mirrored(self) -> Samples:
         """Give the samples of -u, which an equation of odd terms has as a solution too."""
-        return replace(
-            self, u=-self.u, v=None if self.v is None else -self.v, f=None if self.f is None else -self.f
-        )
+        return replace(self, u=-self.u, v=None if self.v is None else -self.v, f=None if self.f is None else -self.f)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +136,7 @@ class SimulatedSamples(Samples):
     noise: float = 0.0
 
     def observed(self) -> Samples:
-        """What an experiment would have given: no truth, and no word on the noise."""
+        """Give what an experiment would have: no truth, and no word on the noise."""
         return Samples(self.t, self.u, self.v, self.f, None, self.source, self.ends)
 
     def truth(self, candidates: Library) -> Float[ndarray, " terms"] | None:
@@ -174,12 +176,18 @@ def read_all(paths: Sequence[Path], ends: Ends = "unknown") -> list[Samples]:
     first = data[0]
     for samples in data[1:]:
         if samples.sites != first.sites:
-            raise InputError(f"{samples.source}: it has {samples.sites} sites, {first.source} has {first.sites}; fit them apart")
+            raise InputError(
+                f"{samples.source}: it has {samples.sites} sites, {first.source} has {first.sites}; fit them apart"
+            )
         if samples.is_complex != first.is_complex:
-            raise InputError(f"{samples.source}: one of it and {first.source} is real, the other complex; fit them apart")
+            raise InputError(
+                f"{samples.source}: one of it and {first.source} is real, the other complex; fit them apart"
+            )
         for name in ("v", "f"):
             if (getattr(samples, name) is None) != (getattr(first, name) is None):
-                raise InputError(f"{samples.source}: only one of it and {first.source} has columns {name}1..{name}N; fit them apart")
+                raise InputError(
+                    f"{samples.source}: only one of it and {first.source} has columns {name}1..{name}N; fit them apart"
+                )
     return data
 
 
@@ -242,10 +250,14 @@ def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Sample
 
     columns = list(table.columns)
     if "t" not in columns:
-        raise InputError(f"{source}: there is no column t; the header must be t,u1..uN[,v1..vN][,f1..fN] or t,re1..reN,im1..imN")
+        raise InputError(
+            f"{source}: there is no column t; the header must be t,u1..uN[,v1..vN][,f1..fN] or t,re1..reN,im1..imN"
+        )
     for column in columns:
         if not re.fullmatch(r"t|f|trajectory|(u|v|f|re|im)[1-9]\d{0,5}", column):
-            raise InputError(f"{source}: unknown column {column!r}; there are: t, u1.., v1.., f1.. or f, re1.., im1.., trajectory")
+            raise InputError(
+                f"{source}: unknown column {column!r}; there are: t, u1.., v1.., f1.. or f, re1.., im1.., trajectory"
+            )
     if len(table) == 0:
         raise InputError(f"{source}: it has 0 row(s) of data; a motion needs at least 2")
     numbers = {}
@@ -263,12 +275,14 @@ def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Sample
         numbers[column] = values.to_numpy(dtype=float)
 
     def block(prefix: str) -> np.ndarray | None:
-        found = sorted((int(c[len(prefix) :]) for c in columns if re.fullmatch(rf"{prefix}\d+", c)))
+        found = sorted(int(c[len(prefix) :]) for c in columns if re.fullmatch(rf"{prefix}\d+", c))
         if not found:
             return None
         if found != list(range(1, len(found) + 1)):
             missing = next(k for k in range(1, len(found) + 1) if k not in found)
-            raise InputError(f"{source}: column {prefix}{missing} is missing; sites are numbered {prefix}1, {prefix}2, ... without gaps")
+            raise InputError(
+                f"{source}: column {prefix}{missing} is missing; sites are numbered {prefix}1, {prefix}2, ... without gaps"
+            )
         return np.column_stack([numbers[f"{prefix}{k}"] for k in found])
 
     u, v, f, real, imaginary = (block(prefix) for prefix in ("u", "v", "f", "re", "im"))
@@ -276,7 +290,9 @@ def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Sample
         raise InputError(f"{source}: give either columns u1..uN (real field) or re1..reN and im1..imN (complex field)")
     if real is not None and imaginary is not None:
         if real.shape != imaginary.shape:
-            raise InputError(f"{source}: {real.shape[1]} columns re but {imaginary.shape[1]} columns im; they must be the same")
+            raise InputError(
+                f"{source}: {real.shape[1]} columns re but {imaginary.shape[1]} columns im; they must be the same"
+            )
         u = real + 1j * imaginary
     assert u is not None
     if "f" in columns:
@@ -323,7 +339,9 @@ def _read_npz(path: Path, ends: Ends) -> list[Samples]:
             arrays = {name: stored[name] for name in stored.files}
     except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
         reason = "it holds pickled objects, which are never loaded" if "pickle" in str(error).lower() else str(error)
-        raise InputError(f"{path}: not an NPZ file of plain arrays: {reason}; write it with numpy.savez(path, t=t, u=u)") from None
+        raise InputError(
+            f"{path}: not an NPZ file of plain arrays: {reason}; write it with numpy.savez(path, t=t, u=u)"
+        ) from None
     for name in ("t", "u"):
         if name not in arrays:
             raise InputError(f"{path}: the array {name!r} is missing; there are: {', '.join(arrays) or 'none'}")
@@ -338,14 +356,16 @@ def _read_npz(path: Path, ends: Ends) -> list[Samples]:
         raise InputError(f"{path}: array t has shape {arrays['t'].shape}; it must be (T,)")
 
     def matrix(name: str) -> np.ndarray | None:
-        array = arrays.get(name)
-        if array is None:
+        if name not in arrays:
             return None
+        array: np.ndarray = arrays[name]
         array = array.astype(complex if array.dtype.kind == "c" else float)
         if array.ndim == 1:
-            array = array[:, None]
+            array = array.reshape(-1, 1)
         if array.ndim != 2 or len(array) != len(arrays["t"]):
-            raise InputError(f"{path}: array {name} has shape {array.shape}; it must be ({len(arrays['t'])}, N) as t has {len(arrays['t'])} times")
+            raise InputError(
+                f"{path}: array {name} has shape {array.shape}; it must be ({len(arrays['t'])}, N) as t has {len(arrays['t'])} times"
+            )
         return array
 
     t, u, v, f = arrays["t"].astype(float), matrix("u"), matrix("v"), matrix("f")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -40,7 +41,10 @@ def sample_times(
 
 
 def integrate(
-    chain: Motion, start: Float[ndarray, " state"], times: Float[ndarray, " time"], method: Integrator = "dop853"
+    chain: Motion,
+    start: Float[ndarray, " state"],
+    times: Float[ndarray, " time"],
+    method: Integrator = "dop853",
 ) -> Float[ndarray, "state time"]:
     """Integrate a chain from `start` at times[0] through all `times`.
 
@@ -73,7 +77,10 @@ def integrate(
 
 
 def runge_kutta(
-    rate: Callable[[float, ndarray], ndarray], start: Float[ndarray, " state"], times: Float[ndarray, " time"], step: float
+    rate: Callable[[float, ndarray], ndarray],
+    start: Float[ndarray, " state"],
+    times: Float[ndarray, " time"],
+    step: float,
 ) -> Float[ndarray, "state time"]:
     """Integrate dy/dt = rate(t, y) by the classical Runge-Kutta method of order 4.
 
@@ -85,7 +92,7 @@ def runge_kutta(
     y = np.array(start, dtype=float)
     states = [y]
     with np.errstate(all="ignore"):
-        for begin, end in zip(times[:-1], times[1:], strict=True):
+        for begin, end in itertools.pairwise(times):
             count = max(1, round((end - begin) / step))
             h = (end - begin) / count
             for k in range(count):
@@ -102,7 +109,9 @@ def runge_kutta(
 
 
 def _unbounded(t: float) -> InputError:
-    return InputError(f"the simulation fails near t = {t:g}: the state grows without bound; check parameters and initial state")
+    return InputError(
+        f"the simulation fails near t = {t:g}: the state grows without bound; check parameters and initial state"
+    )
 
 
 def simulate(

@@ -342,7 +342,7 @@ def substitute(text: str, values: dict[str, float]) -> str:
     return ast.unparse(Put().visit(check(text, tuple(values))))
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def symbolic(text: str, names: tuple[str, ...] = ()) -> sympy.Expr:
     """Turn a term into SymPy; numbers become exact rationals, `names` real symbols."""
     import sympy
@@ -436,9 +436,7 @@ def real_parts(text: str, is_complex: bool) -> tuple[dict[Slot, sympy.Symbol], t
         for part in parts:
             slots[Slot(name, offset, part)] = sympy.Symbol(f"{name}{part}_{offset + MAX_OFFSET}", real=True)
         real = slots[Slot(name, offset)]
-        values[site_symbol(name, offset)] = (
-            real + sympy.I * slots[Slot(name, offset, "im")] if "im" in parts else real
-        )
+        values[site_symbol(name, offset)] = real + sympy.I * slots[Slot(name, offset, "im")] if "im" in parts else real
     for name in ("t", "n"):
         symbol = sympy.Symbol(name, real=True)
         if expression.has(symbol):
