@@ -34,6 +34,7 @@ KINDS = (
     "spline",
     "trend_filtered",
 )
+LOADS = ("pysindy", "scipy.interpolate", "scipy.linalg", "scipy.optimize")
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from methods.derivatives import takes
+from methods.derivatives import LOADS, takes
 from methods.method import Abilities, Fit
 from methods.regression import rows
 from systems.lattice import Library
@@ -30,7 +30,7 @@ class LeastSquares:
     def abilities(self) -> Abilities:
         """As far as the differentiation goes."""
         uneven, missing = takes(self.differentiation)
-        return Abilities(uneven=uneven, missing=missing)
+        return Abilities(uneven=uneven, missing=missing, loads=LOADS)
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:  # noqa: ARG002
         """Minimise |y - A xi|^2."""

@@ -14,6 +14,7 @@ Heavy packages (torch, pysindy) are imported where they are used, so that listin
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -40,6 +41,7 @@ class Abilities:
         uneven: times that are not evenly spaced.
         missing: values that are NaN.
         truth: it must be shown the truth (a ceiling, not a contestant).
+        loads: packages that a fit imports; they are loaded before its clock starts.
     """
 
     complex: bool = True
@@ -47,6 +49,7 @@ class Abilities:
     uneven: bool = True
     missing: bool = False
     truth: bool = False
+    loads: tuple[str, ...] = ()
 
 
 class Skipped(Exception):
@@ -171,6 +174,8 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
     if reason:
         raise Skipped(reason)
     shown = [s.observed() if isinstance(s, SimulatedSamples) and not method.abilities.truth else s for s in data]
+    for package in method.abilities.loads:
+        importlib.import_module(package)
     wall, cpu = time.perf_counter(), time.process_time()
     fit = method.fit(shown, library, order, seed)
     return replace(fit, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)

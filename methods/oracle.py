@@ -12,6 +12,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from methods.derivatives import LOADS
 from methods.method import Abilities, Fit, Skipped
 from methods.regression import Regression, assemble, rows
 from systems.lattice import Library
@@ -33,7 +34,7 @@ class Oracle:
     @property
     def abilities(self) -> Abilities:
         """It needs the truth."""
-        return Abilities(missing=True, truth=True)
+        return Abilities(missing=True, truth=True, loads=LOADS)
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:  # noqa: ARG002
         """Minimise |y - A xi|^2 over the terms of the equation.

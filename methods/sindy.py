@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from methods.derivatives import takes
+from methods.derivatives import LOADS, takes
 from methods.method import Abilities, Fit
 from methods.regression import Regression, rows
 from systems.errors import InputError, unknown
@@ -81,7 +81,7 @@ class STLSQ:
     def abilities(self) -> Abilities:
         """As far as the differentiation goes."""
         uneven, missing = takes(self.differentiation)
-        return Abilities(uneven=uneven, missing=missing)
+        return Abilities(uneven=uneven, missing=missing, loads=LOADS)
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Threshold and refit until the support stays."""
@@ -115,7 +115,7 @@ class SR3:
     def abilities(self) -> Abilities:
         """As far as the differentiation goes."""
         uneven, missing = takes(self.differentiation)
-        return Abilities(uneven=uneven, missing=missing)
+        return Abilities(uneven=uneven, missing=missing, loads=LOADS)
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Minimise the relaxed objective, then refit on the support."""
@@ -147,7 +147,7 @@ class PySINDy:
     def abilities(self) -> Abilities:
         """As far as the differentiation goes."""
         uneven, missing = takes(self.differentiation)
-        return Abilities(uneven=uneven, missing=missing)
+        return Abilities(uneven=uneven, missing=missing, loads=LOADS)
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Hand the scaled rows to the optimiser."""

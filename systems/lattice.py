@@ -6,9 +6,11 @@ Everything is dimensionless unless a system says otherwise.
 
 from __future__ import annotations
 
+import ast
 import functools
 import importlib.util
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +19,19 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from systems.errors import InputError, unknown
-from systems.terms import Slot, Term, check, compiled, express, partials, real_parts, substitute, symbolic
+from systems.terms import (
+    FUNCTIONS,
+    Slot,
+    Term,
+    TermError,
+    check,
+    compiled,
+    express,
+    partials,
+    real_parts,
+    substitute,
+    symbolic,
+)
 
 if TYPE_CHECKING:
     import scipy.sparse
@@ -81,8 +95,6 @@ def library(name: str, terms: str | Sequence[str], source: str = "", *, with_ima
 
 
 def _is_product(text: str) -> bool:
-    import ast
-
     tree = check(text)
     return not (isinstance(tree, ast.BinOp) and isinstance(tree.op, (ast.Add, ast.Sub, ast.Div)))
 
@@ -129,26 +141,45 @@ class System:
         """Check every text and name; nothing is computed yet."""
         names = tuple(self.parameters)
         where = f"system {self.name!r}"
-        if self.order not in (1, 2):
+        for key in ("name", "title", "equation", "half_length", "source", "notes"):
+            if not isinstance(getattr(self, key), str):
+                raise InputError(f"{where}: {key} is {getattr(self, key)!r}; it must be a text")
+        if isinstance(self.order, bool) or self.order not in (1, 2):
             raise InputError(f"{where}: order is {self.order!r}; it must be 1 or 2")
+        if isinstance(self.sites, bool) or not isinstance(self.sites, int) or self.sites < 1:
+            raise InputError(f"{where}: sites is {self.sites!r}; it must be a whole number of at least 1")
         if self.ends not in get_args(Ends) or self.ends == "unknown":
             raise unknown("ends", str(self.ends), [e for e in get_args(Ends) if e != "unknown"], where)
         if self.integrator not in get_args(Integrator):
             raise unknown("integrator", str(self.integrator), get_args(Integrator), where)
         if not self.initials:
             raise InputError(f"{where}: it needs an initial state, such as u = 'exp(-x**2)'")
-        taken = {"u", "f", "t", "n", "i", "pi", "x", "N"} & set(names)
+        taken = {"u", "f", "t", "n", "i", "pi", "x", "N", *FUNCTIONS} & set(names)
         if taken:
             raise InputError(f"{where}: a parameter cannot be called {sorted(taken)[0]!r}; that name has a meaning")
-        check(self.equation, names)
-        check(self.half_length, (*names, "N"))
-        for initial in self.initials.values():
-            check(initial.u, (*names, "x"))
-            check(initial.v, (*names, "x"))
+        self.with_parameters(self.parameters)
+        self._check("equation", self.equation, names)
+        self._check("half_length", self.half_length, (*names, "N"), without=("t", "n"))
+        for kind, initial in self.initials.items():
+            self._check(f"initials.{kind}.u", initial.u, (*names, "x"), without=("t",))
+            self._check(f"initials.{kind}.v", initial.v, (*names, "x"), without=("t",))
         listed = [one.name for one in self.libraries]
         for one in listed:
             if listed.count(one) > 1:
                 raise InputError(f"{where}: it has two libraries called {one!r}")
+
+    def _check(self, key: str, text: str, names: tuple[str, ...], without: tuple[str, ...] | None = None) -> None:
+        """Check one text; with `without`, it is computed before there is a field, and these names have no value."""
+        where = f"system {self.name!r}: {key}"
+        if not isinstance(text, str):
+            raise InputError(f"{where} is {text!r}; it must be a text")
+        try:
+            tree = check(text, names)
+        except TermError as error:
+            raise InputError(f"{where}: {error}") from None
+        for node in ast.walk(tree) if without is not None else ():
+            if isinstance(node, ast.Subscript) or (isinstance(node, ast.Name) and node.id in (without or ())):
+                raise InputError(f"{where}: {text!r} holds {ast.unparse(node)}, which has no value there")
 
     def with_parameters(self, given: Mapping[str, float]) -> dict[str, float]:
         """Fill the defaults up with the given values.
@@ -209,9 +240,9 @@ class System:
             raise unknown("initial state", kind, self.initials, f"system {self.name!r}")
         values = self.with_parameters(parameters)
         n = np.arange(sites) - (sites - 1) / 2
-        # An endless or negative length comes out as nan or inf and is told below.
+        # A length that is endless, negative or not real comes out as nan and is told below.
         with np.errstate(all="ignore"):
-            length = float(np.real(_numeric(self.half_length, {**values, "N": float(sites)})))
+            length = _positive(_numeric(self.half_length, {**values, "N": float(sites)}))
             x = 2 * length * n / max(sites - 1, 1)
             shift = variation.uniform(-2, 2) * 2 * length / max(sites - 1, 1) if variation is not None else 0.0
             arguments = {**values, "x": x - shift, "n": n}
@@ -229,7 +260,11 @@ class System:
             )
         if not self.is_complex:
             if np.any(np.abs(u.imag) > 0) or np.any(np.abs(v.imag) > 0):
-                raise InputError(f"system {self.name!r}: the initial state {kind!r} is complex, but the field is real")
+                listed = ", ".join(f"{name}={value:g}" for name, value in values.items())
+                raise InputError(
+                    f"system {self.name!r}: the initial state {kind!r} is complex for {listed}, but the field is real; "
+                    "check the parameters (a kink's speed v must be below 1)"
+                )
             u, v = u.real, v.real
         return u, (v if self.order == 2 else None)
 
@@ -244,6 +279,12 @@ def _numeric(text: str, values: Mapping[str, Any]) -> Any:
     return sympy.lambdify(symbols, expression, modules="numpy")(
         *(np.asarray(value, dtype=complex) for value in values.values())
     )
+
+
+def _positive(value: Any) -> float:
+    """Take a computed length as a number; nan when it is not a positive one."""
+    number = complex(value)
+    return number.real if number.imag == 0 and 0 < number.real < math.inf else math.nan
 
 
 def _slow_waves(n: ndarray, sites: int, is_complex: bool, draw: np.random.Generator) -> ndarray:
@@ -335,7 +376,8 @@ def evaluate(
     fields: dict[tuple[str, str], ndarray] = {}
     for name, array in (("u", u), ("v", v), ("f", f)):
         if array is not None:
-            padded = array[:, index] * factor
+            # A wall holds zero even where the value that stands in for it is missing.
+            padded = np.where(factor == 0, 0.0, array[:, index] * factor)
             fields[name, "re"], fields[name, "im"] = padded.real, padded.imag
     n = (np.arange(sites) - (sites - 1) / 2)[observed(sites, reach, ends)]
     bundle = compiled(tuple(term.text for term in terms), is_complex)
@@ -514,11 +556,14 @@ def load_module(path: Path) -> Any:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    # Dataclasses look their module up by its name.
+    sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-    except InputError:
-        raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        del sys.modules[spec.name]
+        if isinstance(error, InputError):
+            raise InputError(f"{path}: {error}") from error
         raise InputError(f"{path}: it cannot be imported: {type(error).__name__}: {error}") from error
     return module
 
@@ -545,21 +590,37 @@ def _from_toml(path: Path) -> System:
     for key in ("name", "equation", "order", "initials"):
         if key not in content:
             raise InputError(f"{path}: the key {key!r} is missing")
+    is_complex = content.get("complex", False)
+    if not isinstance(is_complex, bool):
+        raise InputError(f"{path}: complex is {is_complex!r}; it must be true or false")
+    for key in ("parameters", "initials", "libraries"):
+        if not isinstance(content.get(key, {}), dict):
+            raise InputError(f"{path}: {key} is {content[key]!r}; it must be a table, as under [{key}]")
+    for kind, texts in content["initials"].items():
+        if not isinstance(texts, dict) or "u" not in texts or not set(texts) <= {"u", "v"}:
+            raise InputError(f"{path}: initials.{kind} is {texts!r}; it must be a table of u and, for order 2, v")
     try:
-        is_complex = bool(content.get("complex", False))
         return System(
             name=content["name"],
             title=content.get("title", content["name"]),
             equation=content["equation"],
             order=content["order"],
             is_complex=is_complex,
-            parameters={name: float(value) for name, value in content.get("parameters", {}).items()},
+            parameters=content.get("parameters", {}),
             initials={name: Initial(**texts) for name, texts in content["initials"].items()},
-            libraries=tuple(library(name, terms) for name, terms in content.get("libraries", {}).items()),
+            libraries=tuple(_library_of(name, terms) for name, terms in content.get("libraries", {}).items()),
             source=content.get("source", str(path)),
             **{key: content[key] for key in optional if key in content},
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: {error}") from None
+
+
+def _library_of(name: str, terms: Any) -> Library:
+    """Make a library of what a file has under libraries.NAME."""
+    if not isinstance(terms, str) and not (isinstance(terms, list) and all(isinstance(one, str) for one in terms)):
+        raise InputError(f"libraries.{name} is {terms!r}; it must be a list of terms, or one text with ; between them")
+    try:
+        return library(name, terms)
+    except TermError as error:
+        raise InputError(f"libraries.{name}: {error}") from None

@@ -6,6 +6,7 @@ column `trajectory` where one file holds several. NPZ has the arrays `t, u[, v, 
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -81,6 +82,8 @@ class Samples:
                     f"{where}: u has {self.u.shape[1]} sites in {self.u.shape[0]} rows, {name} has shape {array.shape}; "
                     "they must be the same"
                 )
+            if np.iscomplexobj(array) and (name == "f" or not np.iscomplexobj(self.u)):
+                raise InputError(f"{where}: {name} is complex; it must be real{'' if name == 'f' else ' as u is'}")
             if np.any(np.isinf(array)):
                 row, site = (int(k) for k in np.argwhere(np.isinf(array))[0])
                 raise InputError(
@@ -173,6 +176,14 @@ def read_all(paths: Sequence[Path], ends: Ends = "unknown") -> list[Samples]:
         InputError: a file is unsound, or they do not fit together.
     """
     data = [samples for path in paths for samples in read(path, ends)]
+    _check_alike(data)
+    return data
+
+
+def _check_alike(data: Sequence[Samples]) -> None:
+    """Refuse trajectories of different sites or columns, and none at all."""
+    if not data:
+        raise InputError("no samples are given; give at least one file or trajectory")
     first = data[0]
     for samples in data[1:]:
         if samples.sites != first.sites:
@@ -188,7 +199,6 @@ def read_all(paths: Sequence[Path], ends: Ends = "unknown") -> list[Samples]:
                 raise InputError(
                     f"{samples.source}: only one of it and {first.source} has columns {name}1..{name}N; fit them apart"
                 )
-    return data
 
 
 def write(data: Sequence[Samples], path: Path) -> None:
@@ -200,6 +210,7 @@ def write(data: Sequence[Samples], path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"{path}: the ending {path.suffix!r} is not one of {', '.join(FORMATS)}")
+    _check_alike(data)
     with whole(path) as temporary:
         if suffix == ".npz":
             arrays = {"t": np.concatenate([samples.t for samples in data])}
@@ -224,7 +235,7 @@ def _read_table(path: Path) -> pandas.DataFrame:
             table = pd.read_parquet(path)
         except Exception as error:
             raise InputError(f"{path}: not a Parquet file: {str(error).splitlines()[0]}") from None
-        table.columns = pd.Index([str(column).strip() for column in table.columns])
+        table.columns = pd.Index(_named_once([str(column).strip() for column in table.columns], path))
         return table
     try:
         # The header by itself, so that a column that occurs twice is seen before pandas renames it.
@@ -236,13 +247,32 @@ def _read_table(path: Path) -> pandas.DataFrame:
         raise InputError(f"{path}: not a table: {reason}; every row needs as many values as the header") from None
     except (UnicodeDecodeError, ValueError) as error:
         raise InputError(f"{path}: not a text file (UTF-8): {error}") from None
-    header = [str(name).strip() for name in raw.iloc[0]]
+    header = _named_once([str(name).strip() for name in raw.iloc[0]], path)
+    body = raw.iloc[1:].reset_index(drop=True)
+    body.columns = pd.Index(header)
+    if body.iloc[:, -1].isna().any():
+        _refuse_short_rows(path, len(header))
+    return body
+
+
+def _named_once(header: list[str], path: Path) -> list[str]:
+    """Refuse a column that occurs twice."""
     for name in header:
         if header.count(name) > 1:
             raise InputError(f"{path}: the column {name!r} occurs twice; leave one out")
-    body = raw.iloc[1:].reset_index(drop=True)
-    body.columns = pd.Index(header)
-    return body
+    return header
+
+
+def _refuse_short_rows(path: Path, width: int) -> None:
+    """Refuse rows that end early, which pandas fills up with gaps: a file that was cut off looks so."""
+    with path.open(encoding="utf-8", newline="") as lines:
+        rows = (row for row in csv.reader(line.partition("#")[0] for line in lines) if "".join(row).strip())
+        for number, row in enumerate(rows):
+            if len(row) < width:
+                raise InputError(
+                    f"{path}: row {number}: it has {len(row)} value(s), the header {width}; the row was cut off, or a "
+                    "missing value needs its comma"
+                )
 
 
 def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Samples]:
@@ -264,6 +294,8 @@ def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Sample
     for column in columns:
         if column == "trajectory":
             continue
+        if pd.api.types.is_datetime64_any_dtype(table[column]) or pd.api.types.is_timedelta64_dtype(table[column]):
+            raise InputError(f"{source}: column {column}: dates are not numbers; give the time since the first row")
         values = pd.to_numeric(table[column], errors="coerce")
         wrong = values.isna() & table[column].notna() & (table[column].astype(str).str.strip().str.lower() != "nan")
         if wrong.any():
@@ -332,12 +364,16 @@ def _to_table(data: Sequence[Samples]) -> pandas.DataFrame:
 
 
 def _read_npz(path: Path, ends: Ends) -> list[Samples]:
-    import zipfile
-
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
+        # Opened here, so that it is closed when NumPy gives up.
+        with path.open("rb") as handle:
+            stored = np.load(handle, allow_pickle=False)
+            if not isinstance(stored, np.lib.npyio.NpzFile):
+                raise ValueError("it holds one array without a name")
+            with stored:
+                arrays = {name: stored[name] for name in stored.files}
+    # A damaged archive fails in many ways: zipfile's, zlib's, NumPy's.
+    except Exception as error:
         reason = "it holds pickled objects, which are never loaded" if "pickle" in str(error).lower() else str(error)
         raise InputError(
             f"{path}: not an NPZ file of plain arrays: {reason}; write it with numpy.savez(path, t=t, u=u)"

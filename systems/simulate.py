@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -57,23 +58,76 @@ def integrate(
     """
     if method == "rk4":
         return runge_kutta(chain.right_hand_side, start, times, PAPER_STEP)
-    from scipy.integrate import solve_ivp
-
-    options = (
+    options: dict[str, Any] = (
         {"method": "BDF", "rtol": 1e-9, "atol": 1e-11, "jac": chain.jacobian}
         if method == "bdf"
         else {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
     )
 
+    states, reached = _adaptive(chain, start, times, options)
+    if reached != len(times):
+        raise _unbounded(float(times[reached - 1]))
+    return states
+
+
+def follow(
+    chain: Motion,
+    start: Float[ndarray, " state"],
+    times: Float[ndarray, " time"],
+    tolerance: float,
+    most_evaluations: int,
+) -> tuple[Float[ndarray, "state time"], int]:
+    """Integrate a chain that may break off, as far as it goes.
+
+    Args:
+        chain: what moves.
+        start: the state at times[0].
+        times: when to give the state.
+        tolerance: relative and absolute, of the Runge-Kutta method of order 8.
+        most_evaluations: of the right-hand side; a chain that needs more counts as broken off.
+
+    Returns:
+        the states at the first times, and how many of the times they are.
+    """
+    options = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
+    return _adaptive(chain, start, times, options, most_evaluations)
+
+
+class _Exhausted(Exception):
+    """The right-hand side was evaluated too often."""
+
+
+def _adaptive(
+    chain: Motion, start: ndarray, times: ndarray, options: dict[str, Any], most_evaluations: int | None = None
+) -> tuple[ndarray, int]:
+    from scipy.integrate import solve_ivp
+
+    limit = 1e6 * (1 + float(np.max(np.abs(start))))
+    rate = chain.right_hand_side
+    count = 0
+
     def escaped(_: float, y: ndarray) -> float:
-        return 1e6 * (1 + float(np.max(np.abs(start)))) - float(np.max(np.abs(y)))
+        return limit - float(np.max(np.abs(y)))
+
+    def counted(t: float, y: ndarray) -> ndarray:
+        nonlocal count
+        count += 1
+        if most_evaluations is not None and count > most_evaluations:
+            raise _Exhausted
+        return rate(t, y)
 
     escaped.terminal = True  # type: ignore[attr-defined]
-    with np.errstate(all="ignore"):
-        found = solve_ivp(chain.right_hand_side, (times[0], times[-1]), start, t_eval=times, events=escaped, **options)
-    if found.status != 0 or found.y.shape[1] != len(times) or not np.all(np.isfinite(found.y)):
-        raise _unbounded(float(found.t[-1]) if len(found.t) else float(times[0]))
-    return np.asarray(found.y)
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            found = solve_ivp(counted, (times[0], times[-1]), start, t_eval=times, events=escaped, **options)
+        except (_Exhausted, FloatingPointError, RuntimeError, ValueError, np.linalg.LinAlgError):
+            return np.asarray(start)[:, None], 1
+    finite = np.all(np.isfinite(found.y), axis=0) if len(found.t) else np.zeros(0, dtype=bool)
+    reached = int(np.argmin(finite)) if not np.all(finite) else found.y.shape[1]
+    if reached == 0:
+        return np.asarray(start)[:, None], 1
+    return np.asarray(found.y[:, :reached]), reached
 
 
 def runge_kutta(
@@ -147,6 +201,8 @@ def simulate(
     times = sample_times() if times is None else times
     if sites < 1:
         raise InputError(f"sites: {sites} is too few; at least 1 is needed")
+    if len(times) < 2 or not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
+        raise InputError("times: give at least two finite ones that increase")
     if sites * len(times) > MAX_VALUES:
         raise InputError(f"sites x samples is {sites * len(times)}, more than {MAX_VALUES}; take fewer")
     if ends == "unknown":

@@ -39,7 +39,8 @@ FUNCTIONS = (
 )  # fmt: skip
 CONSTANTS = ("t", "n", "i", "pi")
 
-MAX_LENGTH = 500
+MAX_LENGTH = 4000
+MAX_DEPTH = 100
 MAX_OFFSET = 50
 MAX_POWER = 12
 MAX_DEGREE = 24
@@ -70,6 +71,9 @@ def check(text: str, names: tuple[str, ...] = ()) -> ast.expr:
     """
     if len(text) > MAX_LENGTH:
         raise TermError(text, MAX_LENGTH, f"longer than {MAX_LENGTH} characters; split it into several terms")
+    for column, character in enumerate(text.rstrip()):
+        if character == "#" or (character in "\r\n" and text[:column].strip()):
+            raise TermError(text, column, "a term is one line without a comment")
     # A leading blank is an indentation to Python; the columns of errors are those of the text as given.
     lead = len(text) - len(text.lstrip())
     try:
@@ -81,8 +85,20 @@ def check(text: str, names: tuple[str, ...] = ()) -> ast.expr:
         hint = "write abs(u[n]) for |u_n|" if "|" in text else "write for example u[n+1]+u[n-1]-2*u[n]"
         problem = "it is empty" if not text.strip() else f"not an expression; {hint}"
         raise TermError(text, column, problem) from None
+    if _depth(tree) > MAX_DEPTH:
+        raise TermError(text, 0, f"nested deeper than {MAX_DEPTH}; split it into several terms")
     _Whitelist(text, names, lead).visit(tree)
     return tree
+
+
+def _depth(tree: ast.expr) -> int:
+    """Count the levels of a tree, without recursion."""
+    level: list[ast.AST] = [tree]
+    depth = 0
+    while level and depth <= MAX_DEPTH:
+        level = [child for node in level for child in ast.iter_child_nodes(node)]
+        depth += 1
+    return depth
 
 
 class _Whitelist(ast.NodeVisitor):
@@ -334,7 +350,11 @@ def substitute(text: str, values: dict[str, float]) -> str:
 
     class Put(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.expr:
-            return ast.Constant(values[node.id]) if node.id in values else node
+            if node.id not in values:
+                return node
+            size = ast.Constant(abs(values[node.id]))
+            # A sign inside the constant would bind more weakly than a power: -2**2 is -4.
+            return ast.UnaryOp(ast.USub(), size) if values[node.id] < 0 else size
 
         def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
             return node
@@ -417,11 +437,14 @@ class Compiled:
     function: Callable[..., Sequence[Any]]
 
 
-def real_parts(text: str, is_complex: bool) -> tuple[dict[Slot, sympy.Symbol], tuple[sympy.Expr, ...]]:
+def real_parts(
+    text: str, is_complex: bool, *, for_derivatives: bool = False
+) -> tuple[dict[Slot, sympy.Symbol], tuple[sympy.Expr, ...]]:
     """Write a term in real variables.
 
     A real field gives one expression, a complex one two (real and imaginary part), in the variables u = p + i q.
-    A measured input f is real in both.
+    A measured input f is real in both. With `for_derivatives` the sign of a complex z is written z/|z|, which SymPy can
+    derive; it has no value at z = 0.
 
     Raises:
         TermError: the term is not real on a real field.
@@ -442,6 +465,11 @@ def real_parts(text: str, is_complex: bool) -> tuple[dict[Slot, sympy.Symbol], t
         if expression.has(symbol):
             slots[Slot(name)] = symbol
     written = expression.xreplace(values)
+    if is_complex and for_derivatives:
+        written = written.replace(
+            lambda part: isinstance(part, sympy.sign) and not part.args[0].is_real,
+            lambda part: part.args[0] / sympy.Abs(part.args[0]),
+        )
     if is_complex:
         return slots, tuple(sympy.expand_complex(written).as_real_imag())
     if written.has(sympy.I):
@@ -468,7 +496,7 @@ def partials(
         the compiled function, and for each of its outputs (term, part, slot): which term, its real (0) or imaginary (1)
         part, and the variable it is derived by. Derivatives that vanish identically are left out.
     """
-    written = [real_parts(text, is_complex) for text in texts]
+    written = [real_parts(text, is_complex, for_derivatives=True) for text in texts]
     slots = {slot: symbol for found, _ in written for slot, symbol in found.items()}
     expressions, places = [], []
     for term, (found, parts) in enumerate(written):
@@ -483,21 +511,46 @@ def partials(
 
 def _lambdify(slots: dict[Slot, sympy.Symbol], expressions: Sequence[sympy.Expr], backend: Backend) -> Compiled:
     import sympy
+    from sympy.printing.numpy import NumPyPrinter
 
     order = sorted(slots)
-    modules: Any = "numpy"
-    if backend == "torch":
-        import torch
-
-        # SymPy's own names for what torch calls otherwise; d|x|/dx of a real x is sign(x).
-        modules = [
-            {"Abs": torch.abs, "abs": torch.abs, "sign": torch.sign, "atan": torch.atan, "sqrt": torch.sqrt,
-             **{name: getattr(torch, name) for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log")}},
-            "math",
-        ]  # fmt: skip
+    symbols = [slots[slot] for slot in order]
     dirac = [expression.replace(sympy.DiracDelta, lambda *_: sympy.Integer(0)) for expression in expressions]
-    function = sympy.lambdify([slots[slot] for slot in order], dirac, modules=modules, cse=True)
+    if backend == "numpy":
+        return Compiled(tuple(order), sympy.lambdify(symbols, dirac, modules="numpy", cse=True))
+    # NumPy's code with torch's functions under NumPy's names.
+    settings = {"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True}
+    function = sympy.lambdify(symbols, dirac, modules=[_torch_names()], printer=NumPyPrinter(settings), cse=True)
     return Compiled(tuple(order), function)
+
+
+def _torch_names() -> dict[str, Any]:
+    """Give torch's functions the names that SymPy's NumPy code calls; they take plain numbers too."""
+    import torch
+
+    def tensor(value: Any) -> torch.Tensor:
+        if isinstance(value, torch.Tensor):
+            return value
+        return torch.as_tensor(value, dtype=torch.complex128 if isinstance(value, complex) else torch.float64)
+
+    def lifted(function: Callable[..., torch.Tensor]) -> Callable[..., torch.Tensor]:
+        return lambda *values: function(*(tensor(value) for value in values))
+
+    def imaginary(value: torch.Tensor) -> torch.Tensor:
+        return value.imag if value.is_complex() else torch.zeros_like(value)
+
+    same = ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "abs", "angle", "real", "conj")
+    return {
+        **{name: lifted(getattr(torch, name)) for name in same},
+        "sign": lifted(torch.sgn), "arctan": lifted(torch.atan), "arctan2": lifted(torch.atan2),
+        "imag": lifted(imaginary), "pi": math.pi, "e": math.e,
+    }  # fmt: skip
+
+
+def combination(terms: Sequence[Term], coefficients: Sequence[float]) -> Term:
+    """Write the sum of coefficients times terms as one term, every digit kept."""
+    parts = [f"{value:.17g}*({term.text})" for term, value in zip(terms, coefficients, strict=True) if value != 0]
+    return Term(" + ".join(parts) or "0")
 
 
 def express(target: Term, terms: Sequence[Term], is_complex: bool) -> Float[ndarray, " terms"] | None:

@@ -1,0 +1,1 @@
+"""How it is compared: suites, the runner, scores, tables, figures and the command line."""

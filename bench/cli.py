@@ -1,0 +1,620 @@
+"""The command line: `latticebench list|simulate|fit|run|table|figures|compare`.
+
+Everything heavy is imported where it is used, so that `--help`, `list` and tab completion answer at once.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from systems.errors import InputError, unknown
+
+if TYPE_CHECKING:
+    import pandas
+    from rich.console import Console
+    from rich.table import Table
+
+    from bench.suite import Case, Suite
+    from methods.method import Fit
+
+app = typer.Typer(
+    name="latticebench",
+    help="Find the equations of motion of nonlinear lattices from data, and measure how well each method does it.",
+    epilog="Start with:  latticebench run tiny    or    latticebench list systems",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+
+Kind = Literal["systems", "libraries", "methods", "suites"]
+AnyEnds = Literal["unknown", "free", "fixed", "periodic", "antiperiodic"]
+KnownEnds = Literal["free", "fixed", "periodic", "antiperiodic"]
+
+
+def main() -> None:
+    """Run the command line; bad input is one line on standard error and exit code 2."""
+    try:
+        code = app(standalone_mode=False)
+    except InputError as error:
+        _complain(str(error))
+        code = 2
+    except typer.Abort:
+        code = 130
+    except KeyboardInterrupt:
+        code = 130
+    except BrokenPipeError:
+        # The reader (head, a pager) has seen enough; Python would complain once more on exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    except Exception as error:
+        # Usage errors of the command-line library; anything else is a fault of ours and keeps its traceback.
+        message: Callable[[], str] | None = getattr(error, "format_message", None)
+        if message is None:
+            raise
+        text = message().strip().splitlines()
+        if text:
+            _complain(f"{' '.join(text)} (see: latticebench --help)")
+        code = 2
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _complain(text: str) -> None:
+    print("error: " + " ".join(text.splitlines()), file=sys.stderr)
+
+
+# What the shell completes --------------------------------------------------------------------------------------------------
+
+
+def _systems(incomplete: str) -> list[str]:
+    import systems
+
+    return [name for name in systems.names() if name.startswith(incomplete)]
+
+
+def _methods(incomplete: str) -> list[str]:
+    import methods
+
+    return [name for name in methods.registered() if name.startswith(incomplete)]
+
+
+def _suites(incomplete: str) -> list[str]:
+    return [path.stem for path in _suite_files() if path.stem.startswith(incomplete)]
+
+
+def _libraries(incomplete: str) -> list[str]:
+    import systems
+
+    found = {library.name for name in systems.names() for library in systems.find(name).libraries}
+    return sorted(name for name in found if name.startswith(incomplete))
+
+
+def _suite_files() -> list[Path]:
+    return sorted((Path(__file__).parent / "suites").glob("*.toml"))
+
+
+SystemName = Annotated[
+    str, typer.Argument(help="A name from `list systems`, or a .py or .toml file.", autocompletion=_systems)
+]
+Settings = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="May be given several times.")]
+
+
+# Commands ------------------------------------------------------------------------------------------------------------------
+
+
+@app.command("list", epilog="Example:  latticebench list libraries --json")
+def list_(
+    kind: Annotated[Kind, typer.Argument(help="What to list.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
+) -> None:
+    """Say what there is."""
+    rows = {"systems": _system_rows, "libraries": _library_rows, "methods": _method_rows, "suites": _suite_rows}[kind]()
+    if as_json:
+        print(json.dumps(rows, indent=2))
+        return
+    table = _table(list(rows[0]) if rows else ["name"])
+    for row in rows:
+        table.add_row(*(_shown(value) for value in row.values()))
+    _console().print(table)
+
+
+def _system_rows() -> list[dict[str, Any]]:
+    import systems
+
+    rows = []
+    for name in systems.names():
+        system = systems.find(name)
+        rows.append(
+            {
+                "name": name, "equation": f"u{chr(39) * system.order} = {system.equation}",
+                "field": "complex" if system.is_complex else "real", "parameters": dict(system.parameters),
+                "initial states": list(system.initials), "ends": system.ends, "sites": system.sites, "source": system.source,
+            }
+        )  # fmt: skip
+    return rows
+
+
+def _library_rows() -> list[dict[str, Any]]:
+    import systems
+
+    return [
+        {
+            "system": name,
+            "library": library.name,
+            "size": len(library.terms),
+            "terms": list(library.texts),
+            "source": library.source,
+        }
+        for name in systems.names()
+        for library in systems.find(name).libraries
+    ]
+
+
+def _method_rows() -> list[dict[str, Any]]:
+    import methods
+    from methods.method import settings
+
+    return [
+        {"name": name, "what it is": (kind.__doc__ or "").strip().splitlines()[0], "settings": settings(kind)}
+        for name, kind in methods.registered().items()
+    ]
+
+
+def _suite_rows() -> list[dict[str, Any]]:
+    from systems.toml import read_toml
+
+    return [{"name": path.stem, "what it is for": read_toml(path).get("title", "")} for path in _suite_files()]
+
+
+@app.command(
+    epilog="Example:  latticebench simulate phi4 --set C=2 --set v=0.5 --sites 31 --samples 50 --noise 0.01 --seed 1 --out phi4.csv"
+)
+def simulate(
+    system: SystemName,
+    out: Annotated[Path, typer.Option(help="The file to write: .csv, .npz or .parquet.")],
+    given: Settings = None,
+    sites: Annotated[int | None, typer.Option(help="Number of sites N.")] = None,
+    samples: Annotated[int, typer.Option(help="Number of sample times.")] = 50,
+    span: Annotated[float, typer.Option(help="Length of the record; times are 0, span/samples, ...")] = 10.0,
+    uneven: Annotated[bool, typer.Option("--uneven", help="Draw the sample times at random.")] = False,
+    noise: Annotated[float, typer.Option(help="Noise level: sigma over the RMS of the field about its mean.")] = 0.0,
+    missing: Annotated[float, typer.Option(help="Share of the values that are lost.")] = 0.0,
+    trajectories: Annotated[
+        int, typer.Option(help="Number of trajectories; each further one starts from another state.")
+    ] = 1,
+    velocities: Annotated[bool, typer.Option(help="Write v1..vN too (second-order systems).")] = True,
+    ends: Annotated[KnownEnds | None, typer.Option(help="How the chain ends; the system's own if not given.")] = None,
+    initial: Annotated[str | None, typer.Option(help="Initial state; the system's first if not given.")] = None,
+    integrator: Annotated[
+        Literal["rk4", "bdf", "dop853"] | None, typer.Option(help="The system's own (the paper's) if not given.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise, gaps and uneven times.")] = 1,
+) -> None:
+    """Simulate a system and write samples of it."""
+    import pydantic
+
+    import systems
+    from bench.case import samples as make_samples
+    from bench.suite import Case
+    from systems.samples import FORMATS, write
+
+    found = systems.find(system)
+    if out.suffix.lower() not in FORMATS:
+        raise unknown("ending", out.suffix, FORMATS, str(out))
+    try:
+        case = Case(
+            system=system, parameters=_numbers(given), sites=sites, samples=samples, span=span, uneven=uneven, noise=noise,
+            missing=missing, trajectories=trajectories, velocities=velocities, ends=ends, initial=initial,
+            integrator=integrator, seed=seed, library="", label="", method="",
+        )  # fmt: skip
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"--{first['loc'][0]}: {first['msg'].lower()}, it is {first['input']!r}") from None
+    data = make_samples(case, Path())
+    write([one.observed() for one in data], out)
+    listed = ", ".join(f"{name}={value:g}" for name, value in found.with_parameters(case.parameters).items())
+    print(
+        f"{out}: {found.name} ({listed}), {data[0].sites} sites, {len(data[0].t)} samples x {len(data)} trajectories, noise {noise:g}"
+    )
+
+
+@app.command(
+    epilog='Examples:  latticebench fit phi4.csv --system phi4 --library lib2 --method stlsq --set threshold=0.1\n\n'
+    '           latticebench fit my.csv --terms "u[n+1]; u[n-1]; u[n]; u[n]**3" --order 2 --method least-squares'
+)  # fmt: skip
+def fit(
+    files: Annotated[list[Path], typer.Argument(help="One or more .csv, .npz or .parquet files.")],
+    system: Annotated[
+        str | None, typer.Option(help="Take order and libraries from this system.", autocompletion=_systems)
+    ] = None,
+    library: Annotated[str | None, typer.Option(help="A library of the system.", autocompletion=_libraries)] = None,
+    terms: Annotated[str | None, typer.Option(help="Terms of your own, with ; between them.")] = None,
+    order: Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")] = None,
+    method: Annotated[
+        str, typer.Option(help="A name from `list methods`, or a .py file.", autocompletion=_methods)
+    ] = "stlsq",
+    given: Settings = None,
+    ends: Annotated[
+        AnyEnds, typer.Option(help="How the chain ends; unknown uses only sites whose whole stencil was seen.")
+    ] = "unknown",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the method's own draws.")] = 1,
+    json_out: Annotated[
+        str | None, typer.Option("--json", metavar="OUT", help="Write the fit as JSON to a file, or - for the screen.")
+    ] = None,
+) -> None:
+    """Fit the coefficients of a library to recorded samples."""
+    import methods
+    import systems
+    from methods.method import Skipped, make, solve
+    from systems.files import write_text
+    from systems.lattice import library as make_library
+    from systems.samples import read_all
+
+    chosen = make(methods.find(method), _texts(given), "--set")
+    known = None if system is None else systems.find(system)
+    if terms is not None and library is not None:
+        raise InputError("--terms and --library: give one of them")
+    if terms is not None:
+        candidates = make_library("terms", terms)
+    elif known is not None:
+        if library is None:
+            raise InputError(
+                f"--library: choose one of {', '.join(one.name for one in known.libraries)}, or give --terms"
+            )
+        candidates = known.library(library)
+    else:
+        raise InputError(
+            'give --system and --library, or --terms and --order, such as --terms "u[n+1]; u[n-1]; u[n]" --order 2'
+        )
+    if order is None:
+        if known is None:
+            raise InputError("--order: 1 for du/dt, 2 for the second derivative")
+        order = known.order
+    data = read_all(files, ends)
+    try:
+        with _waiting(f"{method}: fitting {len(candidates.terms)} terms"):
+            found = solve(chosen, data, candidates, order, seed)
+    except Skipped as reason:
+        raise InputError(
+            f"method {method!r} cannot fit {data[0].source}: {reason}; choose another with --method"
+        ) from None
+    content = json.dumps(_fit_json(found), indent=2, allow_nan=False) + "\n"
+    if json_out == "-":
+        print(content, end="")
+        return
+    _print_fit(found)
+    if json_out is not None:
+        write_text(Path(json_out), content)
+
+
+def _fit_json(found: Fit) -> dict[str, Any]:
+    texts = found.library.texts
+
+    def number(value: float) -> float | None:
+        return float(value) if math.isfinite(value) else None
+
+    return {
+        "method": found.method, "order": found.order,
+        "coefficients": {text: number(value) for text, value in zip(texts, found.coefficients, strict=True)},
+        "stderr": None if found.stderr is None
+        else {text: number(value) for text, value in zip(texts, found.stderr, strict=True)},
+        "residual": number(found.residual), "seconds": number(found.seconds), "status": found.status,
+    }  # fmt: skip
+
+
+def _print_fit(found: Fit) -> None:
+    from bench.equation import written
+
+    console = _console()
+    table = _table(["term", "coefficient", *(["standard error"] if found.stderr is not None else [])])
+    for k, text in enumerate(found.library.texts):
+        error = [] if found.stderr is None else [f"{found.stderr[k]:.2g}"]
+        table.add_row(_shown(text), f"{found.coefficients[k]:.6g}", *error)
+    console.print(table)
+    console.print(written(found), highlight=False, markup=False, soft_wrap=True)
+    left = "" if math.isnan(found.residual) else f"; {100 * found.residual:.3g} % of the derivative is left"
+    console.print(f"{found.method}: {found.status}{left}; {found.seconds:.2f} s", highlight=False, markup=False)
+
+
+@app.command(epilog="Example:  latticebench run default --jobs 2 --results runs/default")
+def run(
+    suite: Annotated[str, typer.Argument(help="A name from `list suites`, or a .toml file.", autocompletion=_suites)],
+    jobs: Annotated[int | None, typer.Option(min=1, help="Worker processes; one a core if not given.")] = None,
+    results: Annotated[Path | None, typer.Option(help="Where results are kept; runs/SUITE if not given.")] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Run cases that failed again.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
+) -> None:
+    """Run a suite, continuing where it was stopped, and show its table of errors."""
+    from bench.provenance import command_line, describe
+    from bench.run import run as run_suite
+    from bench.store import create
+    from bench.suite import load
+
+    loaded = load(suite)
+    folder = results if results is not None else Path("runs") / loaded.name
+    store = create(folder)
+    jobs = jobs or os.cpu_count() or 1
+    try:
+        with _progress(len(loaded.cases)) as watcher:
+            found, tally = run_suite(loaded, store, jobs=jobs, retry=retry, watcher=watcher)
+    except KeyboardInterrupt:
+        done = sum(1 for _ in store.paths())
+        print(f"stopped; {done} results are in {folder}; the same command continues from there", file=sys.stderr)
+        raise
+    if tally.ran or not store.about():
+        seeds = sorted({case.seed for case in loaded.cases})
+        store.put_about(describe(command_line(), seeds, jobs=jobs, suite=loaded.name, methods=_contestants(loaded)))
+    if as_json:
+        print(_cases_json(found))
+        return
+    _show(found, store.about(), loaded.title)
+    statuses = ", ".join(f"{count} {status}" for status, count in sorted(tally.statuses.items()))
+    print(f"{len(found)} cases ({statuses}); {tally.ran} run now, {tally.reused} were there; kept in {folder}")
+
+
+@app.command(epilog="Example:  latticebench table runs/default --out results/default")
+def table(
+    folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
+    out: Annotated[Path | None, typer.Option(help="Publish the tables here, as CSV, Markdown and LaTeX.")] = None,
+    value: Annotated[str, typer.Option(help="Which score to show.")] = "e2",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
+) -> None:
+    """Show the results of a run as a table, and publish them."""
+    from bench.store import open_store
+    from bench.tables import SCORES, publish
+
+    if value not in SCORES:
+        raise unknown("score", value, SCORES, "--value")
+    store = open_store(folder)
+    found = store.all()
+    if not found:
+        raise InputError(f"{folder}: there are no results in it yet; run a suite with --results {folder}")
+    if as_json:
+        print(_cases_json(found))
+    else:
+        _show(_ordered(found), store.about(), "", value)
+    if out is not None:
+        for path in publish(_ordered(found), store.about(), out):
+            print(path, file=sys.stderr if as_json else sys.stdout)
+
+
+@app.command(epilog="Example:  latticebench figures runs/default --out results/default")
+def figures(
+    folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
+    out: Annotated[Path | None, typer.Option(help="Where to write them; DIR/figures if not given.")] = None,
+) -> None:
+    """Draw the results of a run: coefficients against iteration, errors, error against time and noise."""
+    from bench.figures import draw_all
+    from bench.store import open_store
+
+    store = open_store(folder)
+    found = _ordered(store.all())
+    if not found:
+        raise InputError(f"{folder}: there are no results in it yet; run a suite with --results {folder}")
+    for path in draw_all(found, store.about(), out if out is not None else folder / "figures"):
+        print(path)
+
+
+@app.command(epilog="Example:  latticebench compare results/default runs/default")
+def compare(
+    old: Annotated[Path, typer.Argument(help="A store, a folder with cases.csv, or a cases.csv.")],
+    new: Annotated[Path, typer.Argument(help="The same, to be judged.")],
+    factor: Annotated[float, typer.Option(min=1.0, help="An error that grew beyond this factor is a loss.")] = 2.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
+) -> None:
+    """Say which cases got better or worse; exit code 1 when any got worse."""
+    from bench.compare import compare as compare_tables
+    from bench.tables import read_cases
+
+    found = compare_tables(read_cases(old), read_cases(new), factor)
+    if as_json:
+        rows = {"worse": found.worse.to_dict("records"), "better": found.better.to_dict("records")}
+        rest = {"same": found.same, "gone": found.gone, "new": found.fresh}
+        print(json.dumps({**_jsonable(rows), **rest}, indent=2))
+    else:
+        for name, frame in (("worse", found.worse), ("better", found.better)):
+            for _, row in frame.iterrows():
+                print(f"{name}: {row['case']}: E2 {row['old']} -> {row['new']}")
+        for name in found.gone:
+            print(f"gone: {name}")
+        for name in found.fresh:
+            print(f"new: {name}")
+        print(
+            f"{len(found.worse)} worse, {len(found.better)} better, {found.same} the same (within a factor of {factor:g})"
+        )
+    if len(found.worse):
+        raise typer.Exit(1)
+
+
+# Words and numbers ---------------------------------------------------------------------------------------------------------
+
+
+def _texts(given: Sequence[str] | None) -> dict[str, str]:
+    """Read NAME=VALUE pairs."""
+    pairs = {}
+    for text in given or ():
+        name, equals, value = text.partition("=")
+        if not equals or not name.strip():
+            raise InputError(f"--set {text!r}: write NAME=VALUE, such as --set threshold=0.1")
+        pairs[name.strip()] = value.strip()
+    return pairs
+
+
+def _numbers(given: Sequence[str] | None) -> dict[str, float]:
+    numbers = {}
+    for name, value in _texts(given).items():
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            raise InputError(f"--set {name}={value}: {value!r} is not a number") from None
+    return numbers
+
+
+def _jsonable(value: Any) -> Any:
+    """Put None for NaN and texts for infinities, which JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: _jsonable(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_jsonable(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
+    return value
+
+
+def _cases_json(results: Sequence[Mapping[str, Any]]) -> str:
+    from bench.tables import cases
+
+    return json.dumps(_jsonable(cases(results).to_dict("records")), indent=2)
+
+
+def _ordered(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Put results into an order that does not depend on their keys."""
+
+    def place(result: dict[str, Any]) -> tuple[Any, ...]:
+        case = result["case"]
+        return (
+            case["system"],
+            str(case["parameters"]),
+            str(case["initial"]),
+            case["library"],
+            case["noise"],
+            case["label"],
+            case["seed"],
+        )
+
+    return sorted(results, key=place)
+
+
+def _contestants(suite: Suite) -> dict[str, str]:
+    """Say what each label of a suite stands for, with its settings."""
+    return {
+        case.label: ", ".join([case.method, *(f"{name}={value}" for name, value in case.settings.items())])
+        for case in suite.cases
+        if case.settings or case.method != case.label
+    }
+
+
+# The screen ----------------------------------------------------------------------------------------------------------------
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    # A pipe has no width: let nothing be cut off there.
+    return Console() if sys.stdout.isatty() else Console(width=200)
+
+
+def _table(columns: Sequence[str]) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    shown = Table(box=box.SIMPLE_HEAD)
+    for name in columns:
+        shown.add_column(name, overflow="fold")
+    return shown
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Mapping):
+        value = ", ".join(f"{name}={entry}" for name, entry in value.items())
+    elif isinstance(value, (list, tuple)):
+        value = "; ".join(str(entry) for entry in value)
+    from rich.markup import escape
+
+    return escape(str(value))
+
+
+def _show(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], title: str, value: str = "e2") -> None:
+    from bench.provenance import lines
+    from bench.tables import cases, matrix
+
+    every = cases(results)
+    console = _console()
+    if title:
+        console.print(title, style="bold")
+    _print_frame(console, matrix(every, value))
+    trouble = every[~every["status"].isin(["ok", "skipped"])]
+    for _, row in trouble.iterrows():
+        console.print(
+            f"{row['status']}: {row['data']} | {row['library']} | {row['method']} | seed {row['seed']}: {row['reason']}",
+            style="red", highlight=False, markup=False,
+        )  # fmt: skip
+    wanted = {"e2": "relative error of the coefficients, median over seeds"}
+    console.print(f"{value}: {wanted.get(value, 'median over seeds')}", style="dim", highlight=False)
+    for line in lines(about):
+        console.print(line, style="dim", highlight=False, markup=False)
+
+
+def _print_frame(console: Console, frame: pandas.DataFrame) -> None:
+    shown = _table([str(name) for name in frame.columns])
+    for row in frame.itertuples(index=False):
+        shown.add_row(*(_shown(value) for value in row))
+    console.print(shown)
+
+
+@contextmanager
+def _waiting(text: str) -> Iterator[None]:
+    """Show that something is going on, on a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(text):
+        yield
+
+
+class _Bar:
+    """The progress of a run: a bar with what is left, and a line of what is running."""
+
+    def __init__(self, progress: Any, task: Any, total: int) -> None:
+        self.progress, self.task, self.total = progress, task, total
+        self.running: list[str] = []
+
+    def started(self, case: Case) -> None:
+        self.running.append(case.title)
+        self._show()
+
+    def finished(self, case: Case, result: dict[str, Any]) -> None:
+        if case.title in self.running:
+            self.running.remove(case.title)
+        if result["status"] not in ("ok", "skipped"):
+            self.progress.console.print(
+                f"{result['status']}: {case.title}: {result['reason']}", markup=False, highlight=False
+            )
+        self.progress.advance(self.task)
+        self._show()
+
+    def count(self, left: int) -> None:
+        """Learn how many cases are to be run."""
+        self.progress.update(self.task, total=self.total, completed=self.total - left)
+
+    def _show(self) -> None:
+        self.progress.update(
+            self.task, running="  ".join(f"[{title}]" for title in self.running[:3]).replace("[", "(").replace("]", ")")
+        )
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[_Bar]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("cases"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeRemainingColumn(),
+        TextColumn("{task.fields[running]}", style="dim"),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        yield _Bar(progress, progress.add_task("cases", total=total, running=""), total)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,208 @@
+"""Tidy tables: one row a case, one row a coefficient, and a summary; as Markdown, CSV and LaTeX."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.provenance import lines
+from bench.suite import Case
+from systems.errors import InputError
+from systems.files import write_text
+from systems.terms import Term
+
+SCORES = (
+    "e2", "einf", "spurious", "tpr", "forecast_error", "forecast_horizon", "residual", "conditioning",
+    "seconds", "cpu_seconds", "peak_mib",
+)  # fmt: skip
+FORMATS = ("csv", "md", "tex")
+
+
+def cases(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Make the table of cases: one row each, its settings first.
+
+    Scores of a case that gave none are NaN; `status` and `reason` say why. An error that is infinite stays infinite.
+    """
+    rows = []
+    for result in results:
+        case = Case.model_validate(result["case"])
+        rows.append(
+            {
+                "data": case.data, "library": case.library, "method": case.label, "noise": case.noise, "seed": case.seed,
+                "status": result["status"],
+                **{name: _number(result[name]) for name in SCORES},
+                "reason": result["reason"] or result["note"], "settings": _settings(case.settings), "identity": case.identity,
+            }
+        )  # fmt: skip
+    columns = ["data", "library", "method", "noise", "seed", "status", *SCORES, "reason", "settings", "identity"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def coefficients(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Make the table of coefficients: one row each, with truth and error where there are any."""
+    rows = []
+    for result in results:
+        case = Case.model_validate(result["case"])
+        for term, value in (result["coefficients"] or {}).items():
+            truth = np.nan if result["truth"] is None else result["truth"][term]
+            stderr = np.nan if result["stderr"] is None else _number(result["stderr"][term])
+            rows.append(
+                {
+                    "data": case.data, "library": case.library, "method": case.label, "noise": case.noise,
+                    "seed": case.seed, "term": term, "coefficient": value, "truth": truth, "error": value - truth,
+                    "stderr": stderr,
+                }
+            )  # fmt: skip
+    columns = ["data", "library", "method", "noise", "seed", "term", "coefficient", "truth", "error", "stderr"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def summary(table: pd.DataFrame) -> pd.DataFrame:
+    """Sum the table of cases up over seeds: one row for data, library and method.
+
+    A case that failed or ran out of time counts as an infinite error and stays in the median; one that was skipped leaves no
+    figure. `ok` counts the cases that ended with a fit.
+    """
+    if table.empty:
+        return pd.DataFrame(columns=["data", "library", "method"])
+    counted = table.copy()
+    missed = ~counted["status"].isin(["ok", "skipped"])
+    # No truth, no error: such rows have no E2 even when they are ok.
+    no_truth = counted.groupby(["data", "library"])["e2"].transform(lambda e: e.isna().all()) & ~missed
+    counted.loc[missed & ~no_truth, ["e2", "einf", "forecast_error"]] = np.inf
+    counted.loc[missed, ["tpr", "forecast_horizon"]] = 0.0
+    order = counted.drop_duplicates(["data", "library", "method"]).reset_index(drop=True)
+    grouped = counted.groupby(["data", "library", "method"], sort=False)
+    found = grouped[[*SCORES]].median()
+    found.insert(0, "ok", grouped["status"].agg(lambda s: f"{int((s == 'ok').sum())}/{len(s)}"))
+    keys = pd.MultiIndex.from_frame(order[["data", "library", "method"]])
+    return found.reindex(keys).reset_index()
+
+
+def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
+    """Arrange the summary as data and library against method; a cell without a figure says why."""
+    short = summary(table)
+    reasons = table.drop_duplicates(["data", "library", "method"]).set_index(["data", "library", "method"])["status"]
+    cells = {}
+    for _, row in short.iterrows():
+        key = (row["data"], row["library"], row["method"])
+        status = reasons[key]
+        shown = format_number(row[value])
+        if not shown:
+            # Where the equation is outside the library, what it leaves of the derivative is all there is to say.
+            left = format_number(row["residual"])
+            shown = status if status != "ok" else (f"no truth, leaves {left}" if left else "no truth")
+        cells[key] = shown
+    wide = pd.Series(cells).unstack() if cells else pd.DataFrame()
+    if wide.empty:
+        return wide
+    wide = wide.reindex(
+        index=pd.MultiIndex.from_frame(short[["data", "library"]].drop_duplicates()),
+        columns=list(dict.fromkeys(short["method"])),
+    )
+    wide.index.names = ["data", "library"]
+    return wide.fillna("").reset_index()
+
+
+def format_number(value: Any) -> str:
+    """Write a number with two digits; nothing for NaN."""
+    if isinstance(value, str):
+        return value
+    if value is None or np.isnan(value):
+        return ""
+    if np.isinf(value):
+        return "inf"
+    return f"{value:.2g}" if 1e-3 <= abs(value) < 1e4 or value == 0 else f"{value:.1e}"
+
+
+def publish(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], folder: Path) -> list[Path]:
+    """Write the tables of cases, coefficients and errors, each as CSV, Markdown and LaTeX with its provenance.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    table = cases(results)
+    shown = {
+        "cases": table,
+        "coefficients": coefficients(results),
+        "summary": summary(table),
+        "errors": matrix(table),
+    }
+    written = []
+    for name, frame in shown.items():
+        for form in FORMATS:
+            path = folder / f"{name}.{form}"
+            write_text(path, render(frame, about, form))
+            written.append(path)
+    return written
+
+
+def render(frame: pd.DataFrame, about: Mapping[str, Any], form: str) -> str:
+    """Write a table as text: `csv` with all digits, `md` and `tex` to be read; the provenance stands at its head."""
+    head = lines(about)
+    if form == "csv":
+        return "".join(f"# {line}\n" for line in head) + frame.to_csv(index=False)
+    readable = frame.drop(columns=[name for name in ("identity", "settings") if name in frame])
+    for name in readable.columns:
+        if pd.api.types.is_float_dtype(readable[name]):
+            readable[name] = [format_number(value) for value in readable[name]]
+    if form == "md":
+        quoted = readable.map(lambda value: str(value).replace("|", "\\|"))
+        if "term" in quoted:
+            quoted["term"] = [f"`{term}`" for term in quoted["term"]]
+        return quoted.to_markdown(index=False, disable_numparse=True) + "\n\n" + "".join(f"- {line}\n" for line in head)
+    if "term" in readable:
+        readable["term"] = [f"${Term(text).latex}$" for text in readable["term"]]
+    escaped = readable.map(lambda value: str(value) if str(value).startswith("$") else _tex(str(value)))
+    escaped.columns = pd.Index([_tex(str(name)) for name in escaped.columns])
+    body = " \\\\\n".join(" & ".join(row) for row in escaped.itertuples(index=False))
+    columns = "l" * len(escaped.columns)
+    return (
+        "".join(f"% {line}\n" for line in head)
+        + f"\\begin{{tabular}}{{{columns}}}\n\\hline\n"
+        + " & ".join(escaped.columns) + " \\\\\n\\hline\n" + body + " \\\\\n\\hline\n\\end{tabular}\n"
+    )  # fmt: skip
+
+
+def read_cases(path: Path) -> pd.DataFrame:
+    """Read a published table of cases, or make it from a store.
+
+    Raises:
+        InputError: there is neither at `path`.
+    """
+    if path.is_dir():
+        if (path / "store.json").is_file():
+            from bench.store import open_store
+
+            return cases(open_store(path).all())
+        path = path / "cases.csv"
+    if not path.is_file():
+        raise InputError(f"{path}: no such table; give a store of results, a folder with cases.csv, or a cases.csv")
+    try:
+        table = pd.read_csv(path, comment="#", keep_default_na=True)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a table of cases: {error}") from None
+    missing = [name for name in ("identity", "status", "e2") if name not in table]
+    if missing:
+        raise InputError(f"{path}: not a table of cases: the column {missing[0]!r} is missing")
+    return table
+
+
+def _number(value: Any) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _settings(given: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={value}" for name, value in given.items())
+
+
+def _tex(text: str) -> str:
+    table = {
+        "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
+        "^": r"\^{}", "~": r"\~{}", "|": r"\textbar{}",
+    }  # fmt: skip
+    return "".join(table.get(letter, letter) for letter in text)
