@@ -9,8 +9,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,11 +18,7 @@ import typer
 from systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
-    import pandas
-    from rich.console import Console
-    from rich.table import Table
-
-    from bench.suite import Case, Suite
+    from bench.suite import Suite
     from methods.method import Fit
 
 app = typer.Typer(
@@ -116,14 +111,13 @@ def list_(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
 ) -> None:
     """Say what there is."""
+    from bench.screen import show_rows
+
     rows = {"systems": _system_rows, "libraries": _library_rows, "methods": _method_rows, "suites": _suite_rows}[kind]()
     if as_json:
         print(json.dumps(rows, indent=2))
         return
-    table = _table(list(rows[0]) if rows else ["name"])
-    for row in rows:
-        table.add_row(*(_shown(value) for value in row.values()))
-    _console().print(table)
+    show_rows(list(rows[0]), [list(row.values()) for row in rows])
 
 
 def _system_rows() -> list[dict[str, Any]]:
@@ -239,8 +233,8 @@ def fit(
     terms: Annotated[str | None, typer.Option(help="Terms of your own, with ; between them.")] = None,
     order: Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")] = None,
     method: Annotated[
-        str, typer.Option(help="A name from `list methods`, or a .py file.", autocompletion=_methods)
-    ] = "stlsq",
+        str | None, typer.Option(help="A name from `list methods`, or a .py file.", autocompletion=_methods)
+    ] = None,
     given: Settings = None,
     ends: Annotated[
         AnyEnds, typer.Option(help="How the chain ends; unknown uses only sites whose whole stencil was seen.")
@@ -253,12 +247,14 @@ def fit(
     """Fit the coefficients of a library to recorded samples."""
     import methods
     import systems
+    from bench.screen import show_fit, waiting
     from methods.method import Skipped, make, solve
     from systems.files import write_text
     from systems.lattice import library as make_library
     from systems.samples import read_all
 
-    chosen = make(methods.find(method), _texts(given), "--set")
+    method = method or methods.DEFAULT
+    chosen = make(methods.find(method), _texts(given))
     known = None if system is None else systems.find(system)
     if terms is not None and library is not None:
         raise InputError("--terms and --library: give one of them")
@@ -280,7 +276,7 @@ def fit(
         order = known.order
     data = read_all(files, ends)
     try:
-        with _waiting(f"{method}: fitting {len(candidates.terms)} terms"):
+        with waiting(f"{method}: fitting {len(candidates.terms)} terms"):
             found = solve(chosen, data, candidates, order, seed)
     except Skipped as reason:
         raise InputError(
@@ -290,7 +286,7 @@ def fit(
     if json_out == "-":
         print(content, end="")
         return
-    _print_fit(found)
+    show_fit(found)
     if json_out is not None:
         write_text(Path(json_out), content)
 
@@ -310,20 +306,6 @@ def _fit_json(found: Fit) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _print_fit(found: Fit) -> None:
-    from bench.equation import written
-
-    console = _console()
-    table = _table(["term", "coefficient", *(["standard error"] if found.stderr is not None else [])])
-    for k, text in enumerate(found.library.texts):
-        error = [] if found.stderr is None else [f"{found.stderr[k]:.2g}"]
-        table.add_row(_shown(text), f"{found.coefficients[k]:.6g}", *error)
-    console.print(table)
-    console.print(written(found), highlight=False, markup=False, soft_wrap=True)
-    left = "" if math.isnan(found.residual) else f"; {100 * found.residual:.3g} % of the derivative is left"
-    console.print(f"{found.method}: {found.status}{left}; {found.seconds:.2f} s", highlight=False, markup=False)
-
-
 @app.command(epilog="Example:  latticebench run default --jobs 2 --results runs/default")
 def run(
     suite: Annotated[str, typer.Argument(help="A name from `list suites`, or a .toml file.", autocompletion=_suites)],
@@ -335,6 +317,7 @@ def run(
     """Run a suite, continuing where it was stopped, and show its table of errors."""
     from bench.provenance import command_line, describe
     from bench.run import run as run_suite
+    from bench.screen import progress_bar, show_results
     from bench.store import create
     from bench.suite import load
 
@@ -343,7 +326,7 @@ def run(
     store = create(folder)
     jobs = jobs or os.cpu_count() or 1
     try:
-        with _progress(len(loaded.cases)) as watcher:
+        with progress_bar(len(loaded.cases)) as watcher:
             found, tally = run_suite(loaded, store, jobs=jobs, retry=retry, watcher=watcher)
     except KeyboardInterrupt:
         done = sum(1 for _ in store.paths())
@@ -355,7 +338,7 @@ def run(
     if as_json:
         print(_cases_json(found))
         return
-    _show(found, store.about(), loaded.title)
+    show_results(found, store.about(), loaded.title)
     statuses = ", ".join(f"{count} {status}" for status, count in sorted(tally.statuses.items()))
     print(f"{len(found)} cases ({statuses}); {tally.ran} run now, {tally.reused} were there; kept in {folder}")
 
@@ -368,6 +351,7 @@ def table(
     as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
 ) -> None:
     """Show the results of a run as a table, and publish them."""
+    from bench.screen import show_results
     from bench.store import open_store
     from bench.tables import SCORES, publish
 
@@ -380,7 +364,7 @@ def table(
     if as_json:
         print(_cases_json(found))
     else:
-        _show(_ordered(found), store.about(), "", value)
+        show_results(_ordered(found), store.about(), "", value)
     if out is not None:
         for path in publish(_ordered(found), store.about(), out):
             print(path, file=sys.stderr if as_json else sys.stdout)
@@ -454,7 +438,9 @@ def _numbers(given: Sequence[str] | None) -> dict[str, float]:
         try:
             numbers[name] = float(value)
         except ValueError:
-            raise InputError(f"--set {name}={value}: {value!r} is not a number") from None
+            numbers[name] = math.nan
+        if not math.isfinite(numbers[name]):
+            raise InputError(f"--set {name}={value}: {value!r} is not a number")
     return numbers
 
 
@@ -500,120 +486,6 @@ def _contestants(suite: Suite) -> dict[str, str]:
         for case in suite.cases
         if case.settings or case.method != case.label
     }
-
-
-# The screen ----------------------------------------------------------------------------------------------------------------
-
-
-def _console() -> Console:
-    from rich.console import Console
-
-    # A pipe has no width: let nothing be cut off there.
-    return Console() if sys.stdout.isatty() else Console(width=200)
-
-
-def _table(columns: Sequence[str]) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    shown = Table(box=box.SIMPLE_HEAD)
-    for name in columns:
-        shown.add_column(name, overflow="fold")
-    return shown
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, Mapping):
-        value = ", ".join(f"{name}={entry}" for name, entry in value.items())
-    elif isinstance(value, (list, tuple)):
-        value = "; ".join(str(entry) for entry in value)
-    from rich.markup import escape
-
-    return escape(str(value))
-
-
-def _show(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], title: str, value: str = "e2") -> None:
-    from bench.provenance import lines
-    from bench.tables import cases, matrix
-
-    every = cases(results)
-    console = _console()
-    if title:
-        console.print(title, style="bold")
-    _print_frame(console, matrix(every, value))
-    trouble = every[~every["status"].isin(["ok", "skipped"])]
-    for _, row in trouble.iterrows():
-        console.print(
-            f"{row['status']}: {row['data']} | {row['library']} | {row['method']} | seed {row['seed']}: {row['reason']}",
-            style="red", highlight=False, markup=False,
-        )  # fmt: skip
-    wanted = {"e2": "relative error of the coefficients, median over seeds"}
-    console.print(f"{value}: {wanted.get(value, 'median over seeds')}", style="dim", highlight=False)
-    for line in lines(about):
-        console.print(line, style="dim", highlight=False, markup=False)
-
-
-def _print_frame(console: Console, frame: pandas.DataFrame) -> None:
-    shown = _table([str(name) for name in frame.columns])
-    for row in frame.itertuples(index=False):
-        shown.add_row(*(_shown(value) for value in row))
-    console.print(shown)
-
-
-@contextmanager
-def _waiting(text: str) -> Iterator[None]:
-    """Show that something is going on, on a terminal."""
-    if not sys.stderr.isatty():
-        yield
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status(text):
-        yield
-
-
-class _Bar:
-    """The progress of a run: a bar with what is left, and a line of what is running."""
-
-    def __init__(self, progress: Any, task: Any, total: int) -> None:
-        self.progress, self.task, self.total = progress, task, total
-        self.running: list[str] = []
-
-    def started(self, case: Case) -> None:
-        self.running.append(case.title)
-        self._show()
-
-    def finished(self, case: Case, result: dict[str, Any]) -> None:
-        if case.title in self.running:
-            self.running.remove(case.title)
-        if result["status"] not in ("ok", "skipped"):
-            self.progress.console.print(
-                f"{result['status']}: {case.title}: {result['reason']}", markup=False, highlight=False
-            )
-        self.progress.advance(self.task)
-        self._show()
-
-    def count(self, left: int) -> None:
-        """Learn how many cases are to be run."""
-        self.progress.update(self.task, total=self.total, completed=self.total - left)
-
-    def _show(self) -> None:
-        self.progress.update(
-            self.task, running="  ".join(f"[{title}]" for title in self.running[:3]).replace("[", "(").replace("]", ")")
-        )
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[_Bar]:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("cases"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeRemainingColumn(),
-        TextColumn("{task.fields[running]}", style="dim"),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        yield _Bar(progress, progress.add_task("cases", total=total, running=""), total)
 
 
 if __name__ == "__main__":

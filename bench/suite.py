@@ -25,7 +25,6 @@ import itertools
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -85,7 +84,7 @@ class Case(_Model):
     time_limit: pydantic.PositiveFloat = 120.0
     memory_limit: pydantic.PositiveInt = 4096
 
-    @cached_property
+    @property
     def identity(self) -> str:
         """The settings that decide the result, as text in a fixed order: what two runs of one case have in common."""
         content = self.model_dump(mode="json", exclude={"label", "time_limit", "memory_limit"}, exclude_defaults=True)
@@ -234,7 +233,10 @@ def load(name: str) -> Suite:
             raise _unsound(shown, f"grid {number}", error, Case) from None
     base = path.resolve().parent
     for label, contestant in file.methods.items():
-        make(methods.find(contestant.method, base), contestant.settings, f"{shown}: methods.{label}")
+        try:
+            make(methods.find(contestant.method, base), contestant.settings)
+        except InputError as error:
+            raise InputError(f"{shown}: methods.{label}: {error}") from None
     for case in cases:
         try:
             system, _ = case.resolve(base)
@@ -248,7 +250,8 @@ def load(name: str) -> Suite:
 
 
 def _unsound(shown: str, place: str, error: pydantic.ValidationError, model: type[_Model]) -> InputError:
-    first = error.errors()[0]
+    # A key that is misspelt is also missing; the misspelling is the better news.
+    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     path = ".".join(str(part) for part in first["loc"])
     where = ": ".join(part for part in (shown, place) if part)
     if first["type"] == "extra_forbidden":

@@ -13,6 +13,9 @@ from systems.lattice import load_module
 if TYPE_CHECKING:
     from methods.method import Method
 
+# What `latticebench fit` uses when no method is named.
+DEFAULT = "stlsq"
+
 
 def registered() -> dict[str, type[Method]]:
     """Give every method of this package by its name: what the modules list in `METHODS`."""

@@ -23,17 +23,8 @@ if TYPE_CHECKING:
 DEGREE = 5
 # A dense eigenvalue problem of this size takes about a second.
 MAX_COEFFICIENTS = 1000
-# Of the derivative package's kinds; trend_filtered, spectral, kalman, rbf and savitzky_golay need their options.
-KINDS = (
-    "finite_difference",
-    "kalman",
-    "kernel",
-    "rbf",
-    "savitzky_golay",
-    "spectral",
-    "spline",
-    "trend_filtered",
-)
+# The kinds of the derivative package; most need their options.
+KINDS = ("finite_difference", "kalman", "kernel", "savitzky_golay", "spectral", "spline", "trend_filtered")
 LOADS = ("pysindy", "scipy.interpolate", "scipy.linalg", "scipy.optimize")
 
 

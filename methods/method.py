@@ -129,7 +129,7 @@ class Method(Protocol):
         ...
 
 
-def make(kind: type[Method], given: Mapping[str, Any], where: str = "") -> Method:
+def make(kind: type[Method], given: Mapping[str, Any]) -> Method:
     """Make a method with settings, given as values or as texts from a command line.
 
     Raises:
@@ -140,10 +140,9 @@ def make(kind: type[Method], given: Mapping[str, Any], where: str = "") -> Metho
     known = settings(kind)
     hints = get_type_hints(kind)
     values = {}
-    place = f"{where}: " if where else ""
     for name, value in given.items():
         if name not in known:
-            raise unknown("setting", name, known, f"{place}method {kind.name!r}")
+            raise unknown("setting", name, known, f"method {kind.name!r}")
         try:
             adapter: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(hints[name])
             if isinstance(value, str) and value.startswith(("[", "{")):
@@ -152,7 +151,7 @@ def make(kind: type[Method], given: Mapping[str, Any], where: str = "") -> Metho
                 values[name] = adapter.validate_python(value)
         except pydantic.ValidationError as error:
             reason = error.errors()[0]["msg"]
-            raise InputError(f"{place}method {kind.name!r}: setting {name} = {value!r}: {reason}") from None
+            raise InputError(f"method {kind.name!r}: setting {name} = {value!r}: {reason}") from None
     return kind(**values)
 
 
@@ -192,7 +191,10 @@ def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:
     if not data:
         raise InputError("there are no samples to fit")
     for samples in data:
-        ghosts(samples.sites, *library.reach, samples.ends)
+        try:
+            ghosts(samples.sites, *library.reach, samples.ends)
+        except InputError as error:
+            raise InputError(f"{samples.source}: {error}") from None
         if library.uses("f") and samples.f is None:
             raise InputError(
                 f"{samples.source}: the library uses f[n], but the data have no measured input f or f1..f{samples.sites}"

@@ -39,7 +39,8 @@ def sparse_fit(regression: Regression, optimizer: str, arguments: Mapping[str, A
         if isinstance(kind, type) and issubclass(kind, BaseOptimizer) and kind is not BaseOptimizer
     }  # fmt: skip
     if optimizer not in known:
-        raise unknown("pysindy optimiser", optimizer, known)
+        error = unknown("pysindy optimiser", optimizer, known)
+        raise InputError(f"{error}; pysindy leaves out those whose solver is not installed (such as cvxpy)")
     scale = regression.scales
     height = np.sqrt(np.mean(regression.target**2)) or 1.0
     # Bagging draws from NumPy's global generator (pysindy 2.1), so it is seeded here and put back.

@@ -276,9 +276,10 @@ def _numeric(text: str, values: Mapping[str, Any]) -> Any:
     names = tuple(sorted(name for name in values if name != "n"))
     expression = symbolic(text, names)
     symbols = [sympy.Symbol(name, real=True) for name in values]
-    return sympy.lambdify(symbols, expression, modules="numpy")(
-        *(np.asarray(value, dtype=complex) for value in values.values())
-    )
+    function = sympy.lambdify(symbols, expression, modules="numpy")
+    # Real arithmetic first: far out a complex 1/cosh(x)**2 is nan, the real one 0. Complex is for roots of negative numbers.
+    found, wide = (function(*(np.asarray(value, dtype=kind) for value in values.values())) for kind in (float, complex))
+    return wide if not np.all(np.isfinite(found)) and np.all(np.isfinite(wide)) else found
 
 
 def _positive(value: Any) -> float:

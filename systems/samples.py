@@ -220,7 +220,9 @@ def write(data: Sequence[Samples], path: Path) -> None:
                     arrays[name] = np.concatenate(found)
             if len(data) > 1:
                 arrays["trajectory"] = np.repeat(np.arange(1, len(data) + 1), [len(samples.t) for samples in data])
-            np.savez_compressed(temporary, allow_pickle=False, **arrays)
+            # NumPy appends .npz to a path that ends otherwise, in capitals too.
+            with temporary.open("wb") as handle:
+                np.savez_compressed(handle, allow_pickle=False, **arrays)
         elif suffix == ".csv":
             _to_table(data).to_csv(temporary, index=False)
         else:
@@ -384,6 +386,8 @@ def _read_npz(path: Path, ends: Ends) -> list[Samples]:
     for name, array in arrays.items():
         if name not in ("t", "u", "v", "f", "trajectory"):
             raise InputError(f"{path}: unknown array {name!r}; there are: t, u, v, f, trajectory")
+        if not isinstance(array, np.ndarray):
+            raise InputError(f"{path}: {name!r} is not an array; write it with numpy.savez(path, t=t, u=u)")
         if name != "trajectory" and array.dtype.kind not in "fiuc":
             raise InputError(f"{path}: array {name}: its values are {array.dtype}, not numbers")
     if arrays["t"].dtype.kind == "c":

@@ -519,3 +519,265 @@ def _spread(
     return [
         scipy.sparse.csr_array((entries[:, k].ravel(), (rows, columns)), shape=shape) for k in range(len(grouped))
     ]
+
+
+# The stretches put together ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Condensed:
+    """What one trajectory's samples say about the coefficients, its own start and drive being unknown too.
+
+    Attributes:
+        rows, target: least squares for a change of the coefficients: rows @ change = target, in units of the noise.
+        own: gives the change of the start (S,) and of the drive's splines (m * parts * border,) that goes with it.
+        transition, defects, stretches: what it was made from.
+    """
+
+    rows: Float[ndarray, "rows terms"]
+    target: Float[ndarray, " rows"]
+    own: Callable[[ndarray], tuple[ndarray, ndarray]]
+    transition: Transition
+    defects: Float[ndarray, "stretch state"]
+    stretches: Stretches
+
+    def moves(self, change: Float[ndarray, " terms"]) -> tuple[Float[ndarray, "time state"], ndarray]:
+        """Give the change of all states (K + 1, S) and of the splines (m, parts, border) for one of the coefficients."""
+        start, splines = self.own(change)
+        moved = np.empty((len(self.defects) + 1, len(start)))
+        moved[0] = start
+        shared = np.tensordot(self.transition.by_coefficient, change, (1, 0)) + self.defects
+        if len(splines):
+            local, width = self._local()
+            shared = shared + np.einsum("kq,kqs->ks", splines[local], self.transition.by_drive)
+        for k, forced in enumerate(shared):
+            moved[k + 1] = moved[k] @ self.transition.by_state[k] + forced
+        dynamics = self.stretches.dynamics
+        return moved, splines.reshape(-1, dynamics.parts, len(dynamics.border))
+
+    def _local(self) -> tuple[ndarray, int]:
+        return _local_columns(self.stretches, self.transition)
+
+
+def _local_columns(stretches: Stretches, transition: Transition) -> tuple[ndarray, int]:
+    """The places among all spline coefficients of the ones that live in each stretch (K, Q)."""
+    assert transition.by_drive is not None
+    assert transition.first is not None
+    width = transition.by_drive.shape[1]
+    each = stretches.dynamics.parts * len(stretches.dynamics.border)
+    return transition.first[:, None] * each + np.arange(width), width
+
+
+def condense(
+    stretches: Stretches,
+    transition: Transition,
+    weights: Float[ndarray, "time state"],
+    residuals: Float[ndarray, "time state"] | None = None,
+    defects: Float[ndarray, "stretch state"] | None = None,
+    edge_weights: ndarray | None = None,
+    edge_residuals: ndarray | None = None,
+) -> Condensed:
+    """Eliminate all states but the first, and then the start and the drive, from the linearised least squares.
+
+    Minimises sum (weights * (residuals - change of state))^2 over the changes that follow
+    change_{k+1} = (d end / d start) change_k + (d end / d xi) change of xi + defects_k.
+
+    Args:
+        stretches: between K + 1 sample times.
+        transition: their derivatives.
+        weights: one over the noise of each observed state (K + 1, S), 0 where nothing was seen.
+        residuals: observed minus present states, 0 when None.
+        defects: end of each stretch minus the next state, 0 when None.
+        edge_weights, edge_residuals: the same as the first two for the sites without an equation,
+            (K + 1, order, parts, border).
+    """
+    dynamics = stretches.dynamics
+    size, terms = dynamics.size, transition.by_coefficient.shape[1]
+    count = len(transition.end)
+    residuals = np.zeros((count + 1, size)) if residuals is None else residuals
+    defects = np.zeros((count, size)) if defects is None else defects
+    edge = _edge_rows(stretches, edge_weights, edge_residuals)
+    splines = edge.shape[1] - 1 if edge is not None else 0
+    columns = size + splines + terms
+    sparse = isinstance(transition.by_state, Sequence) and size > 300
+    if not sparse and (count + 1) * size * columns**2 < MAX_QR_WORK:
+        sums: Any = _Triangle(columns)
+    else:
+        sums = _Squares(size, columns, sparse)
+    if edge is not None:
+        wide = np.zeros((len(edge), columns + 1))
+        wide[:, size : size + splines] = edge[:, :-1]
+        wide[:, -1] = edge[:, -1]
+        sums.add_rows(wide)
+    state: Any = np.eye(size)
+    if sparse:
+        import scipy.sparse
+
+        state = scipy.sparse.csr_array(scipy.sparse.identity(size, format="csr"))
+    other = np.zeros((splines + terms + 1, size))
+    local = _local_columns(stretches, transition)[0] if splines else None
+    for k in range(count + 1):
+        # The last row of `other` is what the defects alone would do.
+        sums.add(state, other, weights[k], residuals[k])
+        if k == count:
+            break
+        through = transition.by_state[k]
+        state = state @ through
+        other = other @ through
+        other[splines:-1] += transition.by_coefficient[k]
+        other[-1] += defects[k]
+        if local is not None:
+            assert transition.by_drive is not None
+            other[local[k]] += transition.by_drive[k]
+        if sparse:
+            state.data[np.abs(state.data) < TAIL * 1e-3 * np.max(np.abs(state.data))] = 0.0
+            state.eliminate_zeros()
+    rows, target, solve = sums.reduce(terms)
+
+    def own(change: ndarray) -> tuple[ndarray, ndarray]:
+        found = solve(change)
+        return found[:size], found[size:]
+
+    return Condensed(rows, target, own, transition, defects, stretches)
+
+
+def _edge_rows(stretches: Stretches, weights: ndarray | None, residuals: ndarray | None) -> ndarray | None:
+    """The rows that hold the drive's splines to what was seen of the sites without an equation; the last column is the target."""
+    if stretches.drive is None or weights is None:
+        return None
+    dynamics, drive = stretches.dynamics, stretches.drive
+    residuals = np.zeros_like(weights) if residuals is None else residuals
+    times = np.append(stretches.begin, stretches.end[-1])
+    first, *curves = drive.basis(times)
+    each = dynamics.parts * len(dynamics.border)
+    place = first[:, None] + np.arange(drive.degree + 1)
+    blocks = []
+    for level in range(dynamics.order):
+        for number in range(each):
+            part, site = divmod(number, len(dynamics.border))
+            weight = weights[:, level, part, site]
+            seen = np.flatnonzero(weight > 0)
+            block = np.zeros((len(seen), drive.count * each + 1))
+            block[np.arange(len(seen))[:, None], place[seen] * each + number] = curves[level][seen] * weight[seen, None]
+            block[:, -1] = residuals[seen, level, part, site] * weight[seen]
+            blocks.append(block)
+    return np.concatenate(blocks)
+
+
+class _Triangle:
+    """Rows of a least-squares problem, kept as their orthogonal factor R."""
+
+    def __init__(self, columns: int) -> None:
+        self.columns = columns
+        self.kept: list[ndarray] = []
+        self.waiting = 0
+
+    def add_rows(self, rows: ndarray) -> None:
+        self.kept.append(rows)
+        self.waiting += len(rows)
+        if self.waiting > 6 * self.columns:
+            self.kept = [np.linalg.qr(np.concatenate(self.kept), mode="r")]
+            self.waiting = len(self.kept[0])
+
+    def add(self, state: ndarray, other: ndarray, weights: ndarray, residuals: ndarray) -> None:
+        seen = np.flatnonzero(weights > 0)
+        if len(seen) == 0:
+            return
+        rows = np.empty((len(seen), self.columns + 1))
+        rows[:, : len(state)] = state[:, seen].T
+        rows[:, len(state) : -1] = other[:-1, seen].T
+        rows[:, -1] = residuals[seen] - other[-1, seen]
+        self.add_rows(rows * weights[seen, None])
+
+    def reduce(self, terms: int) -> tuple[ndarray, ndarray, Callable[[ndarray], ndarray]]:
+        from scipy.linalg import solve_triangular
+
+        own = self.columns - terms
+        rows = np.concatenate(self.kept)
+        scale = np.linalg.norm(rows[:, :-1], axis=0)
+        scale[scale == 0] = 1.0
+        # What the samples do not hold at all stays where it is.
+        ridge = np.zeros((own, self.columns + 1))
+        ridge[np.arange(own), np.arange(own)] = 1e-9 * scale[:own]
+        factor = np.linalg.qr(np.concatenate([rows, ridge]), mode="r")
+        upper, coupled, aim = factor[:own, :own], factor[:own, own:-1], factor[:own, -1]
+
+        def solve(change: ndarray) -> ndarray:
+            return np.asarray(solve_triangular(upper, aim - coupled @ change))
+
+        return factor[own:, own:-1], factor[own:, -1], solve
+
+
+class _Squares:
+    """The same problem as normal equations; the states' block is sparse for long chains."""
+
+    def __init__(self, size: int, columns: int, sparse: bool) -> None:
+        self.size, self.sparse = size, sparse
+        self.block: Any = np.zeros((size, size))
+        if sparse:
+            import scipy.sparse
+
+            self.block = scipy.sparse.csr_array((size, size))
+        self.across = np.zeros((size, columns - size + 1))
+        self.rest = np.zeros((columns - size + 1, columns - size + 1))
+
+    def add_rows(self, rows: ndarray) -> None:
+        tail = rows[:, self.size :]
+        self.rest += tail.T @ tail
+
+    def add(self, state: Any, other: ndarray, weights: ndarray, residuals: ndarray) -> None:
+        tail = other.copy()
+        tail[-1] = residuals - tail[-1]
+        tail *= weights
+        if self.sparse:
+            import scipy.sparse
+
+            weighted = state @ scipy.sparse.diags_array(weights, format="csr")
+        else:
+            weighted = state * weights
+        self.block = self.block + weighted @ weighted.T
+        self.across += weighted @ tail.T
+        self.rest += tail @ tail.T
+
+    def reduce(self, terms: int) -> tuple[ndarray, ndarray, Callable[[ndarray], ndarray]]:
+        import scipy.linalg
+        import scipy.sparse.linalg
+
+        diagonal = self.block.diagonal()
+        ridge = 1e-14 * np.where(diagonal > 0, diagonal, 1.0)
+        if self.sparse:
+            import scipy.sparse
+
+            matrix = scipy.sparse.csc_array(self.block + scipy.sparse.diags_array(ridge))
+            divide = scipy.sparse.linalg.splu(
+                matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            ).solve
+        else:
+            factor = scipy.linalg.cho_factor(self.block + np.diag(ridge))
+
+            def divide(right: ndarray) -> ndarray:
+                return np.asarray(scipy.linalg.cho_solve(factor, right))
+
+        solved = divide(self.across)
+        left = self.rest - self.across.T @ solved
+        left = (left + left.T) / 2
+        # Then the drive, and what is left is about the coefficients.
+        drive = len(left) - 1 - terms
+        inner = np.zeros((drive, terms + 1))
+        if drive:
+            held = np.diag(left)[:drive]
+            near = left[:drive, :drive] + np.diag(1e-14 * np.where(held > 0, held, 1.0))
+            inner = scipy.linalg.solve(near, left[:drive, drive:], assume_a="pos")
+            left = left[drive:, drive:] - left[drive:, :drive] @ inner
+        scale = np.sqrt(np.maximum(np.diag(left)[:-1], 1e-300))
+        values, vectors = np.linalg.eigh(left[:-1, :-1] / scale / scale[:, None])
+        root = np.sqrt(np.maximum(values, 0.0))
+        rows = root[:, None] * vectors.T * scale
+        target = np.where(root > 1e-8, vectors.T @ (left[:-1, -1] / scale) / np.maximum(root, 1e-8), 0.0)
+
+        def solve(change: ndarray) -> ndarray:
+            splines = inner[:, -1] - inner[:, :-1] @ change
+            start = solved[:, -1] - solved[:, :-1] @ np.concatenate([splines, change])
+            return np.concatenate([start, splines])
+
+        return rows, target, solve

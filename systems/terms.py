@@ -44,6 +44,8 @@ MAX_DEPTH = 100
 MAX_OFFSET = 50
 MAX_POWER = 12
 MAX_DEGREE = 24
+MAX_MONOMIALS = 200
+MAX_NESTED = 5
 MAX_NUMBER = 1e12
 
 Backend = Literal["numpy", "torch"]
@@ -106,6 +108,7 @@ class _Whitelist(ast.NodeVisitor):
 
     def __init__(self, text: str, names: tuple[str, ...], lead: int) -> None:
         self.text, self.names, self.lead = text, names, lead
+        self.nested = 0
 
     def refuse(self, node: ast.AST, problem: str) -> TermError:
         return TermError(self.text, getattr(node, "col_offset", 0) + self.lead, problem)
@@ -147,7 +150,11 @@ class _Whitelist(ast.NodeVisitor):
             raise self.refuse(node, f"{called} cannot be called; there are: {', '.join(FUNCTIONS)}")
         if len(node.args) != 1 or node.keywords:
             raise self.refuse(node, f"{node.func.id} takes one argument")
+        if self.nested == MAX_NESTED:
+            raise self.refuse(node, f"functions are nested deeper than {MAX_NESTED}")
+        self.nested += 1
         self.visit(node.args[0])
+        self.nested -= 1
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
         if not isinstance(node.op, (ast.UAdd, ast.USub)):
@@ -168,6 +175,8 @@ class _Whitelist(ast.NodeVisitor):
                 raise self.refuse(node.right, f"powers end at {MAX_POWER}")
         else:
             self.visit(node.right)
+        if isinstance(node.op, (ast.Mult, ast.Pow)) and _monomial_count(node) > MAX_MONOMIALS:
+            raise self.refuse(node, f"multiplied out it has more than {MAX_MONOMIALS} parts")
         if _degree(node) > MAX_DEGREE:
             raise self.refuse(node, f"the total power is above {MAX_DEGREE}")
         value = _number(node)
@@ -237,6 +246,23 @@ def _degree(node: ast.expr) -> float:
         case ast.BinOp(left=left, right=right):
             return max(_degree(left), _degree(right))
     return 0
+
+
+def _monomial_count(node: ast.expr) -> int:
+    """Bound from above how many monomials a tree has when it is multiplied out; a function counts as one."""
+    match node:
+        case ast.UnaryOp(operand=operand):
+            return _monomial_count(operand)
+        case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
+            return _monomial_count(left) + _monomial_count(right)
+        case ast.BinOp(left=left, op=ast.Mult(), right=right):
+            return _monomial_count(left) * _monomial_count(right)
+        case ast.BinOp(left=left, op=ast.Pow(), right=right):
+            count, power = _monomial_count(left), math.ceil(abs(_number(right) or 0))
+            return math.comb(count + power - 1, power)
+        case ast.BinOp(left=left):
+            return _monomial_count(left)
+    return 1
 
 
 @dataclass(frozen=True)
@@ -565,8 +591,13 @@ def express(target: Term, terms: Sequence[Term], is_complex: bool) -> Float[ndar
     columns = [_monomials(term.text, is_complex) for term in terms]
     goal = _monomials(target.text, is_complex)
     basis = sorted({monomial for column in [*columns, goal] for monomial in column}, key=str)
-    matrix = np.array([[complex(column.get(monomial, 0)) for column in columns] for monomial in basis])
-    wanted = np.array([complex(goal.get(monomial, 0)) for monomial in basis])
+    try:
+        matrix = np.array([[complex(column.get(monomial, 0)) for column in columns] for monomial in basis])
+        wanted = np.array([complex(goal.get(monomial, 0)) for monomial in basis])
+    except OverflowError:
+        raise InputError(f"a number in {target.text!r} or in the library is too large") from None
+    if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(wanted))):
+        raise InputError(f"a number in {target.text!r} or in the library is too large")
     matrix = np.concatenate([matrix.real, matrix.imag])
     wanted = np.concatenate([wanted.real, wanted.imag])
     scale = np.linalg.norm(matrix, axis=0)

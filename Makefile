@@ -1,0 +1,42 @@
+# `make bench` and `make test` do all the set-up on a fresh machine: Python 3.10 to 3.13 and make are enough.
+PYTHON ?= python3
+VENV := .venv
+# Windows keeps its programs elsewhere.
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
+READY := $(VENV)/.ready
+
+export OMP_NUM_THREADS = 1
+
+.PHONY: bench test test-slow speed lint types wheel clean
+
+bench: $(READY)
+	$(BIN)/latticebench run default --results runs/default
+
+test: $(READY)
+	$(BIN)/python -m pytest -m "not slow" --benchmark-disable
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest -m slow --benchmark-disable
+
+speed: $(READY)
+	$(BIN)/python -m pytest tests/speed --benchmark-only
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(READY)
+	$(BIN)/mypy
+
+wheel: $(READY)
+	rm -rf dist build
+	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
+
+$(READY): requirements.txt pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $(READY)
+
+clean:
+	rm -rf $(VENV) dist build runs .mypy_cache .ruff_cache .pytest_cache

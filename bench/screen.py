@@ -1,0 +1,140 @@
+"""What a run and its results look like on a terminal."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from bench.equation import written
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
+
+    from bench.suite import Case
+    from methods.method import Fit
+
+MEANINGS = {"e2": "relative error of the coefficients, median over seeds"}
+
+
+def console() -> Console:
+    """Make the console that results are printed on."""
+    from rich.console import Console
+
+    # A pipe has no width: let nothing be cut off there.
+    return Console() if sys.stdout.isatty() else Console(width=200)
+
+
+def show_rows(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a table; lists and tables within a cell are written out."""
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for name in columns:
+        table.add_column(str(name), overflow="fold")
+    for row in rows:
+        table.add_row(*(escape(_text(value)) for value in row))
+    console().print(table)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name}={entry}" for name, entry in value.items())
+    if isinstance(value, (list, tuple)):
+        return "; ".join(str(entry) for entry in value)
+    return str(value)
+
+
+def show_fit(fit: Fit) -> None:
+    """Print a fit: its coefficients, its equation, and what it leaves."""
+    columns = ["term", "coefficient"]
+    rows = [[text, f"{value:.6g}"] for text, value in zip(fit.library.texts, fit.coefficients, strict=True)]
+    if fit.stderr is not None:
+        columns.append("standard error")
+        rows = [[*row, f"{error:.2g}"] for row, error in zip(rows, fit.stderr, strict=True)]
+    show_rows(columns, rows)
+    left = "" if fit.residual != fit.residual else f"; {100 * fit.residual:.3g} % of the derivative is left"
+    for line in (written(fit), f"{fit.method}: {fit.status}{left}; {fit.seconds:.2f} s"):
+        console().print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def show_results(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], title: str, value: str = "e2") -> None:
+    """Print a run's results: one score by data and method, what went wrong, and where the figures come from."""
+    from bench.provenance import lines
+    from bench.tables import cases, matrix
+
+    every = cases(results)
+    screen = console()
+    if title:
+        screen.print(title, style="bold", highlight=False)
+    arranged = matrix(every, value)
+    show_rows(list(arranged.columns), arranged.to_numpy().tolist())
+    for _, row in every[~every["status"].isin(["ok", "skipped"])].iterrows():
+        place = f"{row['data']} | {row['library']} | {row['method']} | seed {row['seed']}"
+        screen.print(f"{row['status']}: {place}: {row['reason']}", style="red", highlight=False, markup=False)
+    for line in (f"{value}: {MEANINGS.get(value, 'median over seeds')}", *lines(about)):
+        screen.print(line, style="dim", highlight=False, markup=False)
+
+
+@contextmanager
+def waiting(text: str) -> Iterator[None]:
+    """Show that something is going on, on a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(text):
+        yield
+
+
+class Bar:
+    """The progress of a run: a bar with what is left, and what is running."""
+
+    def __init__(self, progress: Progress, task: TaskID, total: int) -> None:
+        """Draw on `progress`; there are `total` cases in all."""
+        self.progress, self.task, self.total = progress, task, total
+        self.running: list[str] = []
+
+    def count(self, left: int) -> None:
+        """Learn how many cases are to be run."""
+        self.progress.update(self.task, total=self.total, completed=self.total - left)
+
+    def started(self, case: Case) -> None:
+        """Show a case as running."""
+        self.running.append(case.title)
+        self._name_running()
+
+    def finished(self, case: Case, result: dict[str, Any]) -> None:
+        """Count a case, and say what went wrong with it."""
+        if case.title in self.running:
+            self.running.remove(case.title)
+        if result["status"] not in ("ok", "skipped"):
+            line = f"{result['status']}: {case.title}: {result['reason']}"
+            self.progress.console.print(line, markup=False, highlight=False)
+        self.progress.advance(self.task)
+        self._name_running()
+
+    def _name_running(self) -> None:
+        self.progress.update(self.task, running="   ".join(self.running[:3]))
+
+
+@contextmanager
+def progress_bar(total: int) -> Iterator[Bar]:
+    """Show a run's progress on standard error while the block lasts."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TimeRemainingColumn
+    from rich.text import Text
+
+    class Running(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            return Text(escape(task.fields["running"]), style="dim", overflow="ellipsis", no_wrap=True)
+
+    columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeRemainingColumn(), Running())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        yield Bar(progress, progress.add_task("cases", total=total, running=""), total)

@@ -1,0 +1,49 @@
+"""Coefficient errors must not grow: the suite `accuracy` against the committed baseline, case by case.
+
+A case fails when its E2 (without a truth: its residual) exceeds FACTOR times the baseline's, both counted as at least the
+floor of `bench.compare`. After a change that is meant to move errors, write the baseline anew and read its difference:
+
+    latticebench run accuracy --results runs/accuracy && python tests/accuracy/write_baseline.py runs/accuracy
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from bench.compare import compare
+from bench.run import run
+from bench.store import create
+from bench.suite import load
+from bench.tables import cases, read_cases
+
+BASELINE = Path(__file__).parent / "baseline.csv"
+FACTOR = 2.0
+
+SUITE = load("accuracy")
+TITLES = [case.title for case in SUITE.cases]
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The baseline and the errors of today."""
+    results, _ = run(SUITE, create(tmp_path_factory.mktemp("accuracy") / "store"), jobs=2)
+    return read_cases(BASELINE), cases(results)
+
+
+@pytest.mark.parametrize("number", range(len(TITLES)), ids=TITLES)
+def test_the_error_of_a_case_has_not_grown(number: int, tables: tuple[pd.DataFrame, pd.DataFrame]) -> None:
+    old, new = tables
+    identity = SUITE.cases[number].identity
+    assert identity in set(old["identity"]), "no baseline for this case; write the baseline anew"
+    found = compare(old[old["identity"] == identity], new[new["identity"] == identity], FACTOR)
+    assert found.worse.empty, found.worse.to_string(index=False)
+    assert found.same + len(found.better) == 1
+
+
+def test_a_worse_method_would_be_noticed(tables: tuple[pd.DataFrame, pd.DataFrame]) -> None:
+    old, new = tables
+    spoiled = new.assign(e2=new["e2"].clip(lower=1e-9) * 3, residual=new["residual"] * 3)
+    assert len(compare(old, spoiled, FACTOR).worse) == len(new)

@@ -1,0 +1,17 @@
+"""Write the baseline of the accuracy tests from a run of the suite `accuracy`: python write_baseline.py STORE."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from bench.store import open_store
+from bench.tables import cases, render
+from systems.files import write_text
+
+KEPT = ["data", "library", "method", "noise", "seed", "status", "e2", "residual", "identity"]
+
+if __name__ == "__main__":
+    store = open_store(Path(sys.argv[1]))
+    table = cases(store.all())[KEPT].sort_values(["data", "library", "method"])
+    write_text(Path(__file__).parent / "baseline.csv", render(table, store.about(), "csv"))

@@ -1,0 +1,55 @@
+"""Methods that misbehave, each in a way of its own, for the tests of the runner."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from methods.method import Abilities, Fit
+from systems.lattice import Library
+from systems.samples import Samples
+
+
+@dataclass(frozen=True)
+class Hostile:
+    """Does what `deed` says."""
+
+    name: ClassVar[str] = "hostile"
+    deed: str = "behave"
+    seconds: float = 0.0
+    diary: str = ""
+
+    @property
+    def abilities(self) -> Abilities:
+        return Abilities()
+
+    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:  # noqa: ARG002
+        if self.diary:
+            with Path(self.diary).open("a") as diary:
+                diary.write(f"{self.deed} {self.seconds} {os.getpid()}\n")
+        if self.deed == "fail":
+            raise RuntimeError("the matrix is on holiday")
+        if self.deed == "eat":
+            eaten = []
+            while True:
+                eaten.append(np.ones(2**22))
+        if self.deed == "hang in C":
+            ctypes.PyDLL(None).sleep(600)  # holds the interpreter's lock
+        if self.deed == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.deed == "nan":
+            return Fit(self.name, library, order, np.full(len(library.terms), np.nan), 0.0)
+        time.sleep(self.seconds)
+        draw = np.random.default_rng(seed)
+        return Fit(self.name, library, order, draw.normal(size=len(library.terms)), 0.5)
+
+
+METHODS = (Hostile,)

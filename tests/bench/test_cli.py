@@ -1,0 +1,323 @@
+"""The command line, as a user types it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SHARED = Path(__file__).parents[3] / "shared" / "data" / "measured"
+
+
+def latticebench(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-W", "error", "-m", "bench.cli", *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, timeout=300)
+
+
+def succeed(*arguments: object, cwd: Path) -> str:
+    done = latticebench(*arguments, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with samples of phi^4 and of the DNLS lattice."""
+    place = tmp_path_factory.mktemp("cli")
+    succeed(
+        *[
+            "simulate",
+            "phi4",
+            "--set",
+            "C=2",
+            "--set",
+            "v=0.5",
+            "--sites",
+            "31",
+            "--samples",
+            "50",
+            "--noise",
+            "0.001",
+            "--seed",
+            "1",
+            "--out",
+            "phi4.csv",
+        ],
+        cwd=place,
+    )
+    succeed(*["simulate", "dnls", "--set", "C=0.5", "--integrator", "dop853", "--out", "dnls.parquet"], cwd=place)
+    return place
+
+
+@pytest.mark.parametrize("kind", ["systems", "libraries", "methods", "suites"])
+def test_lists_are_tables_for_people_and_json_for_programs(kind: str, tmp_path: Path) -> None:
+    rows = json.loads(succeed("list", kind, "--json", cwd=tmp_path))
+    shown = succeed("list", kind, cwd=tmp_path)
+    for row in rows:
+        assert str(next(iter(row.values()))) in shown
+
+
+def test_a_simulation_has_the_noise_and_seed_it_was_asked_for(folder: Path, tmp_path: Path) -> None:
+    for name in ("a.csv", "b.csv"):
+        succeed("simulate", "phi4", "--noise", 0.001, "--seed", 1, "--out", name, cwd=tmp_path)
+    assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text() == (folder / "phi4.csv").read_text()
+    header = (tmp_path / "a.csv").read_text().splitlines()[0].split(",")
+    assert header == ["t", *(f"u{n}" for n in range(1, 32)), *(f"v{n}" for n in range(1, 32))]
+
+
+def test_a_fit_prints_its_equation_and_writes_json_in_the_order_of_the_terms(folder: Path) -> None:
+    out = succeed(
+        "fit", "phi4.csv", "--system", "phi4", "--library", "lib2", "--method", "stlsq", "--set", "threshold=0.1",
+        "--json", "fit.json", cwd=folder,
+    )  # fmt: skip
+    assert "u'' = " in out
+    assert "u[n]**3" in out
+    written = json.loads((folder / "fit.json").read_text())
+    assert list(written) == ["method", "order", "coefficients", "stderr", "residual", "seconds", "status"]
+    assert list(written["coefficients"]) == ["u[n+1]", "u[n-1]", "u[n]", "u[n]**3"]
+    np.testing.assert_allclose(list(written["coefficients"].values()), [2, 2, -2, -2], rtol=0.02)
+    assert (written["method"], written["order"], written["status"]) == ("stlsq", 2, "ok")
+
+
+def test_terms_of_ones_own_are_fitted_and_named_as_they_were_given(folder: Path) -> None:
+    terms = " u[n]**3;u[n+1] + u[n-1] - 2*u[n] ; u[n]"
+    out = succeed(
+        "fit", "phi4.csv", "--terms", terms, "--order", 2, "--method", "least-squares", "--ends", "free", "--json", "-",
+        cwd=folder,
+    )  # fmt: skip
+    found = json.loads(out)["coefficients"]
+    assert list(found) == ["u[n]**3", "u[n+1] + u[n-1] - 2*u[n]", "u[n]"]
+    np.testing.assert_allclose(list(found.values()), [-2, 2, 2], rtol=0.02)
+
+
+def test_a_complex_field_is_fitted_with_real_coefficients_of_t_and_i_t(folder: Path) -> None:
+    out = succeed(
+        "fit",
+        "dnls.parquet",
+        "--system",
+        "dnls",
+        "--library",
+        "four",
+        "--method",
+        "least-squares",
+        "--json",
+        "-",
+        cwd=folder,
+    )
+    found = json.loads(out)["coefficients"]
+    assert abs(found["u[n+1]"]) < 0.01
+    assert found["i*u[n+1]"] == pytest.approx(0.5, abs=0.01)
+    assert found["i*abs(u[n])**2*u[n]"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_run_its_table_its_figures_and_its_comparison(tmp_path: Path) -> None:
+    out = succeed("run", "tiny", "--jobs", 2, "--results", "tiny", cwd=tmp_path)
+    assert "9 cases (9 ok); 9 run now, 0 were there" in out
+    assert "phi4 noise=0.01" in out
+    again = succeed("run", "tiny", "--results", "tiny", cwd=tmp_path)
+    assert "0 run now, 9 were there" in again
+    rows = json.loads(succeed("table", "tiny", "--out", "published", "--json", cwd=tmp_path))
+    assert len(rows) == 9
+    for name in ("cases", "coefficients", "summary", "errors"):
+        for form in ("csv", "md", "tex"):
+            text = (tmp_path / "published" / f"{name}.{form}").read_text()
+            for word in ("command: latticebench run tiny", "commit: ", "machine: ", "versions: ", "seeds: 1"):
+                assert word in text
+    files = succeed("figures", "tiny", "--out", "published", cwd=tmp_path).split()
+    assert {Path(file).name for file in files} >= {"errors.png", "error-against-seconds.png", "error-against-noise.png"}
+    assert all((tmp_path / file).stat().st_size > 5000 for file in files)
+    assert "0 worse, 0 better, 9 the same" in succeed("compare", "tiny", "published", cwd=tmp_path)
+
+
+def test_comparing_names_what_got_worse_and_exits_with_1(tmp_path: Path) -> None:
+    succeed("run", "tiny", "--results", "tiny", cwd=tmp_path)
+    succeed("table", "tiny", "--out", "old", cwd=tmp_path)
+    table = (tmp_path / "old" / "cases.csv").read_text()
+    assert "0.00763" in table or "0.0076" in table
+    import pandas as pd
+
+    frame = pd.read_csv(tmp_path / "old" / "cases.csv", comment="#")
+    frame.loc[(frame.method == "stlsq") & (frame.noise == 0.01), "e2"] /= 10
+    frame.to_csv(tmp_path / "better.csv", index=False)
+    worse = latticebench("compare", "better.csv", "tiny", cwd=tmp_path)
+    assert worse.returncode == 1
+    assert "worse: phi4 noise=0.01 | lib2 | stlsq | seed 1" in worse.stdout
+    better = latticebench("compare", "tiny", "better.csv", "--json", cwd=tmp_path)
+    assert better.returncode == 0
+    assert len(json.loads(better.stdout)["better"]) == 1
+
+
+BAD_FILES = {
+    "no-t.csv": ("u1,u2\n1,2\n3,4\n", "no column t"),
+    "text.csv": ("t,u1\n0,1\n1,one\n2,3\n", "row 2, column u1: 'one' is not a number"),
+    "back.csv": ("t,u1\n0,1\n2,2\n1,3\n", "row 3, column t"),
+    "one.csv": ("t,u1\n0,1\n", "1 row(s)"),
+    "short.csv": (
+        "t,u1,u2\n" + "".join(f"{k},{k},{k * k}\n" for k in range(9)),
+        "stencil needs 3 sites, the data have 2",
+    ),
+    "nan.csv": ("t,u1,u2,u3\n0,,,\n1,,,\n2,,,\n", "every value of u is missing"),
+    "empty.csv": ("", "empty"),
+    "void.parquet": ("", "empty"),
+    "words.csv": ("\x00\x01\xff", "words.csv"),
+    "gap.csv": ("t,u1,u3\n0,1,1\n1,1,1\n", "column u2 is missing"),
+    "ragged.csv": ("t,u1\n0,1\n1,2,3,4\n", "not a table"),
+    "notes.txt": ("hello", "ending '.txt'"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_bad_file_is_one_clear_line_and_exit_code_2(name: str, tmp_path: Path) -> None:
+    content, told = BAD_FILES[name]
+    (tmp_path / name).write_bytes(content.encode("latin-1"))
+    done = latticebench("fit", name, "--system", "phi4", "--library", "lib2", "--json", "out.json", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert name in done.stderr
+    assert told in done.stderr
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_a_pickled_npz_is_never_loaded(tmp_path: Path) -> None:
+    class Bomb:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return os.system, (f"touch {tmp_path / 'exploded'}",)
+
+    np.savez(tmp_path / "bomb.npz", t=np.arange(3.0), u=np.array([Bomb(), 1, 2], dtype=object))
+    done = latticebench("fit", "bomb.npz", "--system", "phi4", "--library", "lib2", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "never loaded" in done.stderr
+    assert not (tmp_path / "exploded").exists()
+
+
+BAD_COMMANDS = {
+    "fit phi4.csv --terms __import__('os').system('touch${IFS}pwned') --order 2": "column 1",
+    "fit phi4.csv --terms ().__class__ --order 2": "not part of the term language",
+    "fit phi4.csv --terms u[n+10**9] --order 2": "column 3",
+    "fit phi4.csv --terms u**u**u**u --order 2": "u needs a site",
+    "fit phi4.csv --terms u[n];u[n] --order 2": "twice",
+    "fit phi4.csv --terms u[n]": "--order",
+    "fit phi4.csv": "--terms",
+    "fit phi4.csv --system phi4": "lib1",
+    "fit phi4.csv --system phi4 --library lib9": "unknown library 'lib9'",
+    "fit phi4.csv --system psi4 --library lib1": "did you mean 'phi4'",
+    "fit phi4.csv --system phi4 --library lib1 --method stlqs": "did you mean 'stlsq'",
+    "fit phi4.csv --system phi4 --library lib1 --set tresh=1": "did you mean 'threshold'",
+    "fit phi4.csv --system phi4 --library lib1 --set threshold=big": "threshold = 'big'",
+    "fit phi4.csv --system phi4 --library lib1 --ends open": "--ends",
+    "fit phi4.csv --system phi4 --library lib1 --method oracle": "needs the truth",
+    "fit phi4.csv --terms f[n];u[n] --order 2": "no measured input",
+    "fit phi4.csv dnls.parquet --system phi4 --library lib1": "real, the other complex",
+    "fit nowhere.csv --system phi4 --library lib1": "nowhere.csv: no such file",
+    "fit . --system phi4 --library lib1": "ending",
+    "simulate phi4 --set C=two --out x.csv": "not a number",
+    "simulate phi4 --set D=2 --out x.csv": "unknown parameter 'D'",
+    "simulate phi4 --set v=1.5 --out x.csv": "below 1",
+    "simulate phi4 --set C=-1 --out x.csv": "check the parameters",
+    "simulate phi4 --set C=inf --out x.csv": "C",
+    "simulate phi4 --samples 1 --out x.csv": "--samples",
+    "simulate phi4 --missing 1 --out x.csv": "--missing",
+    "simulate phi4 --initial knik --out x.csv": "did you mean 'kink'",
+    "simulate phi4 --out x.xls": "ending",
+    "simulate phi4 --out /dev/full/x.csv": "cannot be written",
+    "run nothing": "unknown suite",
+    "run bad.toml": "unknown key 'sistem'; did you mean 'system'",
+    "run tiny --results phi4.csv": "a file, not a folder",
+    "table .": "not a store",
+    "figures .": "not a store",
+    "compare phi4.csv phi4.csv": "column 'identity' is missing",
+    "lists systems": "No such command",
+    "list system": "systems",
+}
+
+
+@pytest.mark.parametrize("command", BAD_COMMANDS)
+def test_bad_input_is_one_clear_line_and_exit_code_2(command: str, folder: Path) -> None:
+    (folder / "bad.toml").write_text('[methods.a]\nmethod = "zero"\n[[grid]]\nsistem = "phi4"\nlibraries = ["lib1"]\n')
+    before = sorted(path.name for path in folder.iterdir())
+    done = latticebench(*command.split(), cwd=folder)
+    assert done.returncode == 2, done.stdout
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert BAD_COMMANDS[command] in done.stderr
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_a_method_and_a_system_from_outside_work_without_touching_the_project(tmp_path: Path) -> None:
+    (tmp_path / "guess.py").write_text(
+        "from dataclasses import dataclass\nfrom typing import ClassVar\nimport numpy as np\n"
+        "from methods.method import Abilities, Fit\nfrom methods.regression import rows\n\n"
+        "@dataclass(frozen=True)\nclass Guess:\n    'Least squares, rounded to a grid.'\n\n"
+        "    name: ClassVar[str] = 'guess'\n    grid: float = 0.5\n\n"
+        "    @property\n    def abilities(self):\n        return Abilities()\n\n"
+        "    def fit(self, data, library, order, seed):\n"
+        "        regression = rows(data, library, order, 'spline')\n"
+        "        found = np.round(regression.least_squares() / self.grid) * self.grid\n"
+        "        return Fit(self.name, library, order, found, regression.residual(found))\n\nMETHODS = (Guess,)\n"
+    )
+    (tmp_path / "toda.toml").write_text(
+        'name = "toda"\nequation = "k*(exp(u[n+1]-u[n]) - exp(u[n]-u[n-1]))"\norder = 2\nends = "fixed"\nsites = 9\n'
+        '[parameters]\nk = 1.5\n[initials.bump]\nu = "exp(-x**2)"\n'
+        '[libraries]\ntoda = ["exp(u[n+1]-u[n])", "exp(u[n]-u[n-1])", "u[n]"]\n'
+    )
+    (tmp_path / "mine.toml").write_text(
+        'title = "from outside"\n[methods.rounded]\nmethod = "guess.py"\nsettings = { grid = 0.25 }\n'
+        '[[grid]]\nsystem = "toda.toml"\nlibraries = ["toda"]\nparameters = { k = [0.5, 1.5] }\nspan = 5\n'
+    )
+    rows = json.loads(succeed("run", "mine.toml", "--results", "out", "--json", cwd=tmp_path))
+    assert [row["e2"] for row in rows] == [0.0, 0.0]
+    succeed("simulate", "toda.toml", "--span", 5, "--out", "toda.csv", cwd=tmp_path)
+    out = succeed(
+        "fit",
+        "toda.csv",
+        "--system",
+        "toda.toml",
+        "--library",
+        "toda",
+        "--method",
+        "guess.py",
+        "--json",
+        "-",
+        cwd=tmp_path,
+    )
+    assert list(json.loads(out)["coefficients"].values()) == [1.5, -1.5, 0.0]
+
+
+def measured(name: str) -> Path:
+    path = SHARED / name
+    if not path.is_file():
+        pytest.skip(f"the recording {name} does not lie beside the project")
+    return path
+
+
+def test_the_measured_gliders_give_the_stiffness_of_their_source(tmp_path: Path) -> None:
+    terms = "u[n+1]+u[n-1]; n*(u[n+1]+u[n-1]); u[n]; n*u[n]; v[n]; 1; n"
+    out = succeed(
+        "fit", measured("gliders.csv"), "--terms", terms, "--order", 2, "--ends", "fixed", "--method", "least-squares",
+        "--json", "-", cwd=tmp_path,
+    )  # fmt: skip
+    mean, slope, diagonal, difference, *_ = json.loads(out)["coefficients"].values()
+    # n = -1/2 and +1/2: the coefficients are the mean and the difference of the two sites' springs.
+    stiffness = [
+        [-(diagonal - difference / 2), -(mean - slope / 2)],
+        [-(mean + slope / 2), -(diagonal + difference / 2)],
+    ]
+    np.testing.assert_allclose(stiffness, [[85.76, -77.98], [-31.48, 34.59]], rtol=0.02)
+
+
+def test_the_measured_pendulum_gives_its_frequency_and_damping(tmp_path: Path) -> None:
+    out = succeed(
+        "fit", measured("pendulum.csv"), "--terms", "sin(u[n]); v[n]", "--order", 2, "--method", "least-squares", "--json", "-",
+        cwd=tmp_path,
+    )  # fmt: skip
+    found = json.loads(out)
+    assert found["coefficients"]["sin(u[n])"] == pytest.approx(-64.2, rel=0.01)
+    assert found["coefficients"]["v[n]"] == pytest.approx(-0.0672, rel=0.3)
+    assert found["residual"] < 0.006

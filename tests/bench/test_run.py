@@ -1,0 +1,181 @@
+"""The runner: nothing finished is lost or run twice, and no case harms another, whatever happens."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from bench.run import run
+from bench.store import create
+from bench.suite import Suite, load
+
+HERE = Path(__file__).parent
+posix = pytest.mark.skipif(os.name != "posix", reason="sends POSIX signals")
+
+
+def hostile_suite(folder: Path, methods: dict[str, str], *, seeds: str = "[1]", limits: str = "") -> Suite:
+    """Write a suite with one entry a method: its label and its settings."""
+    folder.mkdir(exist_ok=True)
+    shutil.copy(HERE / "hostile.py", folder / "hostile.py")
+    text = 'title = "hostile"\n'
+    for label, settings in methods.items():
+        text += f'[methods."{label}"]\nmethod = "hostile.py"\nsettings = {{ {settings} }}\n'
+    text += f'[[grid]]\nsystem = "phi4"\nsites = 5\nsamples = 8\nspan = 1.0\nlibraries = ["lib1"]\nseeds = {seeds}\n{limits}\n'
+    (folder / "hostile.toml").write_text(text)
+    return load(str(folder / "hostile.toml"))
+
+
+def diary_lines(path: Path) -> list[str]:
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other(tmp_path: Path) -> None:
+    suite = hostile_suite(
+        tmp_path,
+        {
+            "good": 'deed = "behave"', "failing": 'deed = "fail"', "eating": 'deed = "eat"',
+            "hanging": 'deed = "hang in C"', "dying": 'deed = "die"', "empty": 'deed = "nan"', "slow": "seconds = 0.5",
+        },
+        seeds="[1, 2]", limits="time_limit = 4\nmemory_limit = 1500",
+    )  # fmt: skip
+    results, tally = run(suite, create(tmp_path / "store"), jobs=2)
+    found = {(r["case"]["label"], r["case"]["seed"]): r for r in results}
+    assert len(found) == tally.ran == 14
+    for seed in (1, 2):
+        assert found["good", seed]["status"] == found["slow", seed]["status"] == "ok"
+        assert found["failing", seed]["status"] == "failed"
+        assert "the matrix is on holiday" in found["failing", seed]["reason"]
+        assert found["eating", seed]["status"] == "memory"
+        assert "1500 MiB" in found["eating", seed]["reason"]
+        assert found["hanging", seed]["status"] == "timeout"
+        assert "4 s" in found["hanging", seed]["reason"]
+        assert found["dying", seed]["status"] == "died"
+        assert found["empty", seed]["status"] == "failed"
+        assert "not finite" in found["empty", seed]["reason"]
+
+
+def test_finished_cases_are_not_run_again_and_failures_only_when_asked(tmp_path: Path) -> None:
+    diary = tmp_path / "diary"
+    methods = {"good": f'diary = "{diary}"', "failing": f'deed = "fail", diary = "{diary}"'}
+    suite = hostile_suite(tmp_path / "suite", methods)
+    store = create(tmp_path / "store")
+    first, _ = run(suite, store, jobs=1)
+    again, tally = run(suite, store, jobs=1)
+    assert again == first
+    assert (tally.ran, tally.reused) == (0, 2)
+    assert len(diary_lines(diary)) == 2
+    _, tally = run(suite, store, jobs=1, retry=True)
+    assert (tally.ran, tally.reused) == (1, 1)
+    assert [line.split()[0] for line in diary_lines(diary)].count("fail") == 2
+
+
+def test_a_raised_time_limit_runs_a_timed_out_case_again(tmp_path: Path) -> None:
+    slow = {"slow": "seconds = 1.5"}
+    store = create(tmp_path / "store")
+    results, _ = run(hostile_suite(tmp_path / "s", slow, limits="time_limit = 0.5"), store, jobs=1)
+    assert results[0]["status"] == "timeout"
+    results, _ = run(hostile_suite(tmp_path / "s", slow, limits="time_limit = 60"), store, jobs=1)
+    assert results[0]["status"] == "ok"
+
+
+def test_a_changed_method_is_run_again_and_its_old_result_leaves_the_store(tmp_path: Path) -> None:
+    suite = hostile_suite(tmp_path / "s", {"good": 'deed = "behave"'})
+    store = create(tmp_path / "store")
+    run(suite, store, jobs=1)
+    source = tmp_path / "s" / "hostile.py"
+    source.write_text(source.read_text().replace("0.5)", "0.25)"))
+    results, tally = run(load(str(tmp_path / "s" / "hostile.toml")), store, jobs=1)
+    assert tally.ran == 1
+    assert results[0]["residual"] == 0.25
+    assert len(store.paths()) == 1
+
+
+def test_the_number_of_jobs_changes_no_digit(tmp_path: Path) -> None:
+    suite = load("tiny")
+    one, _ = run(suite, create(tmp_path / "one"), jobs=1)
+    three, _ = run(suite, create(tmp_path / "three"), jobs=3)
+    for a, b in zip(one, three, strict=True):
+        assert a["coefficients"] == b["coefficients"]
+        assert a["e2"] == b["e2"]
+
+
+def start_run(suite: Path, store: Path, jobs: int = 2) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "bench.cli", "run", str(suite), "--results", str(store), "--jobs", str(jobs)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+
+
+def wait_for(condition: object, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.05)
+
+
+@posix
+def test_after_kill_9_of_the_runner_nothing_finished_is_run_again_and_no_worker_stays(tmp_path: Path) -> None:
+    diary = tmp_path / "diary"
+    seeds = str(list(range(8)))
+    hostile_suite(tmp_path / "s", {"good": f'seconds = 0.4, diary = "{diary}"'}, seeds=seeds)
+    suite_file, store = tmp_path / "s" / "hostile.toml", tmp_path / "store"
+    runner = start_run(suite_file, store)
+    wait_for(lambda: len(list((store / "cases").glob("[!.]*.json"))) >= 3)
+    workers = psutil.Process(runner.pid).children(recursive=True)
+    runner.kill()
+    runner.communicate()
+    finished = {path.stem for path in (store / "cases").glob("[!.]*.json")}
+    started = len(diary_lines(diary))
+    wait_for(lambda: not any(w.is_running() and w.status() != psutil.STATUS_ZOMBIE for w in workers), 20)
+    again = start_run(suite_file, store)
+    out, err = again.communicate(timeout=120)
+    assert again.returncode == 0, err
+    assert f"{8 - len(finished)} run now, {len(finished)} were there".encode() in out
+    assert len(diary_lines(diary)) <= started + 8 - len(finished)
+    for path in (store / "cases").glob("[!.]*.json"):
+        assert json.loads(path.read_text())["status"] == "ok"
+
+
+@posix
+def test_after_kill_9_of_a_worker_its_case_is_run_again_and_all_get_their_result(tmp_path: Path) -> None:
+    diary = tmp_path / "diary"
+    hostile_suite(tmp_path / "s", {"good": f'seconds = 0.8, diary = "{diary}"'}, seeds="[1, 2, 3, 4]")
+    runner = start_run(tmp_path / "s" / "hostile.toml", tmp_path / "store")
+    wait_for(lambda: len(diary_lines(diary)) >= 1)
+    os.kill(int(diary_lines(diary)[0].split()[-1]), signal.SIGKILL)
+    out, err = runner.communicate(timeout=120)
+    assert runner.returncode == 0, err
+    assert b"4 cases (4 ok)" in out
+
+
+@posix
+def test_ctrl_c_ends_at_once_with_the_finished_cases_kept(tmp_path: Path) -> None:
+    hostile_suite(tmp_path / "s", {"good": "seconds = 0.3", "long": "seconds = 100"})
+    store = tmp_path / "store"
+    runner = start_run(tmp_path / "s" / "hostile.toml", store)
+    wait_for(lambda: len(list((store / "cases").glob("[!.]*.json"))) >= 1)
+    workers = psutil.Process(runner.pid).children(recursive=True)
+    os.killpg(runner.pid, signal.SIGINT)
+    _, err = runner.communicate(timeout=20)
+    assert runner.returncode == 130
+    assert b"Traceback" not in err
+    assert b"the same command continues" in err
+    wait_for(lambda: not any(w.is_running() and w.status() != psutil.STATUS_ZOMBIE for w in workers), 10)
+    assert len(list((store / "cases").glob("[!.]*.json"))) == 1
+
+
+def test_two_runs_on_one_store_do_not_corrupt_it(tmp_path: Path) -> None:
+    hostile_suite(tmp_path / "s", {"good": "seconds = 0.1"}, seeds=str(list(range(10))))
+    runners = [start_run(tmp_path / "s" / "hostile.toml", tmp_path / "store") for _ in range(2)]
+    for runner in runners:
+        out, err = runner.communicate(timeout=120)
+        assert runner.returncode == 0, err
+        assert b"10 cases (10 ok)" in out
+    assert len(create(tmp_path / "store").all()) == 10

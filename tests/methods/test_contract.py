@@ -1,0 +1,171 @@
+"""What every registered method must do, whatever it is: a new file is tested without writing a test."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import methods
+import systems
+from methods.method import Abilities, Fit, Skipped, make, settings, solve
+from systems.errors import InputError
+from systems.lattice import Library, library
+from systems.samples import Samples, SimulatedSamples
+from systems.simulate import observe, sample_times, simulate
+
+# Settings that make a slow method fast enough for a test; what it finds is not judged here.
+QUICK = {
+    "adam_steps": 20, "lbfgs_steps": 20, "collocation": 31, "max_iterations": 5, "steps": 20, "iterations": 5,
+}  # fmt: skip
+
+METHODS = sorted(methods.registered())
+
+
+def attempt(name: str, samples: SimulatedSamples, candidates: Library, order: int) -> Fit | str:
+    """Fit, or give the reason why the method cannot."""
+    try:
+        return solve(quick(name), [samples], candidates, order, seed=3)
+    except Skipped as skipped:
+        return str(skipped)
+
+
+def quick(name: str) -> methods.method.Method:
+    kind = methods.find(name)
+    return make(kind, {key: value for key, value in QUICK.items() if key in settings(kind)})
+
+
+@pytest.fixture(scope="module")
+def phi4() -> SimulatedSamples:
+    clean = simulate(systems.find("phi4"), sites=11, times=sample_times(31, 4.0), integrator="dop853")
+    return observe(clean, np.random.default_rng(5), noise=0.001)
+
+
+@pytest.fixture(scope="module")
+def dnls() -> SimulatedSamples:
+    clean = simulate(
+        systems.find("dnls"), parameters={"C": 0.5}, sites=9, times=sample_times(31, 4.0), integrator="dop853"
+    )
+    return observe(clean, np.random.default_rng(5), noise=0.001)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_is_a_frozen_dataclass_with_a_name_and_a_docstring(name: str) -> None:
+    kind = methods.find(name)
+    assert kind.name == name
+    assert (kind.__doc__ or "").strip()
+    assert isinstance(kind().abilities, Abilities)
+    for one in dataclasses.fields(kind):  # type: ignore[arg-type]
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(kind(), one.name, None)
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("data", ["phi4", "dnls"])
+def test_a_fit_has_one_finite_coefficient_a_term_and_is_timed(
+    name: str, data: str, request: pytest.FixtureRequest
+) -> None:
+    samples = request.getfixturevalue(data)
+    system = systems.find(data)
+    candidates = system.library("lib2" if data == "phi4" else "four")
+    fit = attempt(name, samples, candidates, system.order)
+    if isinstance(fit, str):
+        assert "complex" in fit
+        assert samples.is_complex
+        return
+    assert fit.method == name
+    assert fit.order == system.order
+    assert fit.library == candidates
+    assert np.all(np.isfinite(fit.coefficients))
+    assert fit.seconds > 0
+    if fit.stderr is not None:
+        assert fit.stderr.shape == fit.coefficients.shape
+    if fit.history is not None:
+        assert fit.history.coefficients.shape == (len(fit.history.step), len(candidates.terms))
+        assert np.all(np.diff(fit.history.step) > 0)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_same_seed_gives_the_same_coefficients_to_the_last_digit(name: str, phi4: SimulatedSamples) -> None:
+    candidates = systems.find("phi4").library("lib2")
+    first, second = (solve(quick(name), [phi4], candidates, 2, seed=3).coefficients for _ in range(2))
+    assert np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_only_a_method_that_declares_it_is_shown_the_truth(
+    name: str, phi4: SimulatedSamples, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[list[Samples]] = []
+    kind = methods.find(name)
+
+    def spy(self: object, data: list[Samples], library: object, order: int, seed: int) -> Fit:
+        seen.append(list(data))
+        return Fit(name, library, order, np.zeros(4), 0.0)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(kind, "fit", spy)
+    solve(kind(), [phi4], systems.find("phi4").library("lib2"), 2, seed=3)
+    told = isinstance(seen[0][0], SimulatedSamples)
+    assert told == kind().abilities.truth
+    if not told:
+        assert seen[0][0].sigma is None
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_takes_missing_values_and_uneven_times_or_says_why_not(name: str) -> None:
+    times = sample_times(40, 4.0, np.random.default_rng(2))
+    clean = simulate(systems.find("phi4"), sites=11, times=times, integrator="dop853")
+    gappy = observe(clean, np.random.default_rng(1), noise=0.001, missing=0.05)
+    fit = attempt(name, gappy, systems.find("phi4").library("lib2"), 2)
+    if isinstance(fit, str):
+        assert "missing" in fit or "even" in fit
+    else:
+        assert np.all(np.isfinite(fit.coefficients))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_two_trajectories_are_fitted_together(name: str, phi4: SimulatedSamples) -> None:
+    other = simulate(
+        systems.find("phi4"), sites=11, times=sample_times(25, 3.0), integrator="dop853",
+        variation=np.random.default_rng(8),
+    )  # fmt: skip
+    fit = solve(quick(name), [phi4, other], systems.find("phi4").library("equation"), 2, seed=1)
+    assert np.all(np.isfinite(fit.coefficients))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_an_unknown_setting_and_a_value_of_another_type_are_refused_by_name(name: str) -> None:
+    kind = methods.find(name)
+    with pytest.raises(InputError, match="unknown setting 'thresold'"):
+        make(kind, {"thresold": 1})
+    numbers = [key for key, value in settings(kind).items() if isinstance(value, float)]
+    for key in numbers[:1]:
+        with pytest.raises(InputError, match=f"setting {key} = 'many'"):
+            make(kind, {key: "many"})
+
+
+def test_a_library_that_the_data_cannot_serve_is_refused_with_the_reason(phi4: SimulatedSamples) -> None:
+    method = methods.find("least-squares")()
+    observed = phi4.observed()
+    for terms, order, reason in [
+        ("f[n]", 2, "no measured input"),
+        ("i*u[n]", 2, "the field is real"),
+        ("v[n]", 1, "has no velocity"),
+        ("u[n+6]; u[n-6]", 2, "stencil needs 13 sites, the data have 11"),
+        ("u[n]", 3, "must be 1"),
+    ]:
+        with pytest.raises(InputError, match=reason):
+            solve(method, [observed], library("mine", terms), order, seed=1)
+
+
+def test_with_known_ends_every_site_counts_so_that_a_chain_of_two_can_be_fitted() -> None:
+    times = sample_times(200, 10.0)
+    first, second = np.cos(times), np.cos(np.sqrt(3.0) * times)
+    # u_1'' = -2 u_1 + u_2 with walls on both sides: the modes (1, 1) and (1, -1) have the frequencies 1 and sqrt 3.
+    u = np.column_stack([first + second, first - second])
+    walls = Samples(times, u, ends="fixed")
+    fit = solve(methods.find("least-squares")(), [walls], library("chain", "u[n+1]+u[n-1]; u[n]"), 2, seed=1)
+    np.testing.assert_allclose(fit.coefficients, [1.0, -2.0], atol=1e-4)
+    with pytest.raises(InputError, match="say how the chain ends"):
+        solve(methods.find("least-squares")(), [Samples(times, u)], library("chain", "u[n+1]+u[n-1]; u[n]"), 2, seed=1)

@@ -1,0 +1,38 @@
+"""Run times, compared within one run: `make speed` prints them side by side, each as a multiple of the fastest."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import methods
+import systems
+from methods.method import make, solve
+from systems.samples import Samples
+from systems.simulate import observe, simulate
+
+FAST = [name for name in sorted(methods.registered()) if not methods.find(name)().abilities.truth]
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    clean = simulate(systems.find("phi4"), integrator="dop853")
+    return observe(clean, np.random.default_rng(1), noise=0.01).observed()
+
+
+@pytest.mark.benchmark(group="one fit of four terms, 31 sites, 50 samples")
+@pytest.mark.parametrize("name", [name for name in FAST if not name.startswith("pinn")])
+def test_fit(benchmark: Any, name: str, samples: Samples) -> None:
+    method, candidates = make(methods.find(name), {}), systems.find("phi4").library("lib2")
+    solve(method, [samples], candidates, 2, seed=1)
+    fit = benchmark.pedantic(solve, args=(method, [samples], candidates, 2, 1), rounds=5, iterations=1)
+    assert np.all(np.isfinite(fit.coefficients))
+
+
+@pytest.mark.benchmark(group="one simulation of ten units of time, 31 sites")
+@pytest.mark.parametrize("integrator", ["rk4", "bdf", "dop853"])
+def test_integrator(benchmark: Any, integrator: Any) -> None:
+    found = benchmark.pedantic(simulate, args=(systems.find("phi4"),), kwargs={"integrator": integrator}, rounds=3)
+    assert np.all(np.isfinite(found.u))
