@@ -71,8 +71,9 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
         return pd.DataFrame(columns=["data", "library", "method"])
     counted = table.copy()
     missed = ~counted["status"].isin(["ok", "skipped"])
-    # No truth, no error: such rows have no E2 even when they are ok.
-    no_truth = counted.groupby(["data", "library"])["e2"].transform(lambda e: e.isna().all()) & ~missed
+    # Where fits ended and yet none has an E2, there is no truth.
+    ended = (counted["status"] == "ok").groupby([counted["data"], counted["library"]]).transform("any")
+    no_truth = ended & counted.groupby(["data", "library"])["e2"].transform(lambda e: bool(e.isna().all()))
     counted.loc[missed & ~no_truth, ["e2", "einf", "forecast_error"]] = np.inf
     counted.loc[missed, ["tpr", "forecast_horizon"]] = 0.0
     order = counted.drop_duplicates(["data", "library", "method"]).reset_index(drop=True)

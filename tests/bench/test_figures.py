@@ -1,0 +1,44 @@
+"""Figures: drawn from results, with their provenance inside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.image
+from PIL import Image
+
+from bench.case import blank
+from bench.figures import draw_all, learning_curve
+from bench.suite import Case
+
+
+def learned() -> dict[str, object]:
+    case = Case(system="phi4", library="lib1", label="net", method="net")
+    made = blank(case)
+    made.update(
+        e2=0.01, seconds=3.0, coefficients={"u[n]": 1.9, "u[n]**3": 0.1}, truth={"u[n]": 2.0, "u[n]**3": 0.0},
+        history={"step": [0, 10, 20], "seconds": [0, 1, 2], "loss": [3, 2, 1], "coefficients": [[0, 0], [1, 0.3], [1.9, 0.1]]},
+    )  # fmt: skip
+    return made
+
+
+def test_the_learning_curve_shows_found_solid_true_dashed_and_absent_black() -> None:
+    axes = learning_curve(learned()).axes[0]
+    solid = [line for line in axes.lines if line.get_linestyle() == "-"]
+    dashed = [line for line in axes.lines if line.get_linestyle() == "--"]
+    assert [list(line.get_ydata()) for line in solid] == [[0, 1, 1.9], [0, 0.3, 0.1]]
+    assert [line.get_color() for line in solid] == ["tab:blue", "black"]
+    assert len(dashed) == 1
+    assert set(dashed[0].get_ydata()) == {2.0}
+
+
+def test_every_figure_is_written_with_its_provenance(tmp_path: Path) -> None:
+    other = learned()
+    other["case"] = Case(system="phi4", library="lib1", label="net", method="net", noise=0.1).model_dump(mode="json")
+    paths = draw_all([learned(), other], {"command": "latticebench run x", "seeds": [1]}, tmp_path)
+    assert {path.name for path in paths} >= {"errors.png", "error-against-seconds.png", "error-against-noise.png"}
+    assert sum(path.name.startswith("coefficients-") for path in paths) == 2
+    for path in paths:
+        assert matplotlib.image.imread(path).std() > 0.01
+        with Image.open(path) as image:
+            assert "command: latticebench run x" in image.text["Description"]

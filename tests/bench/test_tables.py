@@ -1,0 +1,124 @@
+"""Tables: what they count and what they carry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.case import blank
+from bench.compare import compare
+from bench.provenance import describe
+from bench.suite import Case
+from bench.tables import cases, coefficients, format_number, matrix, publish, read_cases, summary
+from systems.errors import InputError
+
+
+def result(method: str, seed: int, e2: float | str | None, status: str = "ok", library: str = "lib1") -> dict[str, Any]:
+    case = Case(system="phi4", library=library, label=method, method=method, seed=seed)
+    made = blank(case, status, "" if status == "ok" else f"{status} it was")
+    if status == "ok":
+        found = {"u[n]": 1.0, "abs(u[n])": 0.5}
+        made.update(
+            e2=e2,
+            residual=0.25,
+            seconds=0.1,
+            coefficients=found,
+            truth=None if e2 is None else {"u[n]": 2.0, "abs(u[n])": 0.0},
+        )
+    return made
+
+
+RESULTS = [
+    result("a", 1, 0.1), result("a", 2, 0.3), result("a", 3, None, "failed"),
+    result("b", 1, 0.2), result("b", 2, None, "timeout"), result("b", 3, None, "died"),
+    result("c", 1, None, "skipped"), result("c", 2, None, "skipped"), result("c", 3, None, "skipped"),
+    result("d", 1, "inf"), result("d", 2, 0.1), result("d", 3, 0.1),
+    result("a", 1, None, library="lib9"), result("b", 1, None, "failed", library="lib9"),
+]  # fmt: skip
+ABOUT = describe(["run", "mine"], [1, 2, 3])
+
+
+def test_one_row_a_case_and_one_row_a_coefficient() -> None:
+    assert len(cases(RESULTS)) == len(RESULTS)
+    table = coefficients(RESULTS)
+    assert len(table) == 2 * sum(r["status"] == "ok" for r in RESULTS)
+    first = table.iloc[0]
+    assert (first.term, first.coefficient, first.truth, first.error) == ("u[n]", 1.0, 2.0, -1.0)
+
+
+def test_a_failure_counts_as_infinite_and_stays_in_the_median_and_a_skip_leaves_no_figure() -> None:
+    short = summary(cases(RESULTS)).set_index(["library", "method"])
+    assert short.loc[("lib1", "a"), "e2"] == 0.3
+    assert short.loc[("lib1", "b"), "e2"] == np.inf
+    assert np.isnan(short.loc[("lib1", "c"), "e2"])
+    assert short.loc[("lib1", "d"), "e2"] == 0.1
+    assert list(short.loc["lib1", "ok"]) == ["2/3", "1/3", "0/3", "3/3"]
+
+
+def test_a_cell_without_a_figure_says_why() -> None:
+    wide = matrix(cases(RESULTS)).set_index("library")
+    assert list(wide.loc["lib1", ["a", "b", "c", "d"]]) == ["0.3", "inf", "skipped", "0.1"]
+    assert wide.loc["lib9", "a"] == "no truth, leaves 0.25"
+    assert wide.loc["lib9", "b"] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0123, "0.012"), (1e-9, "1.0e-09"), (0.0, "0"), (np.nan, ""), (np.inf, "inf"), (123456.0, "1.2e+05")],
+)
+def test_numbers_have_two_digits(value: float, text: str) -> None:
+    assert format_number(value) == text
+
+
+def test_what_is_published_can_be_read_and_carries_where_it_comes_from(tmp_path: Path) -> None:
+    paths = publish(RESULTS, ABOUT, tmp_path)
+    assert len(paths) == 12
+    for path in paths:
+        text = path.read_text()
+        for word in ("command: latticebench run mine", "commit:", "machine:", "versions:", "seeds: 1, 2, 3"):
+            assert word in text
+    pd.testing.assert_frame_equal(
+        read_cases(tmp_path).fillna("-"), cases(RESULTS).replace("", np.nan).fillna("-"), check_dtype=False
+    )
+    tex = (tmp_path / "coefficients.tex").read_text()
+    assert r"$\left|{u_{n}}\right|$" in tex
+    assert r"forecast\_error" in (tmp_path / "cases.tex").read_text()
+
+
+def test_a_file_that_is_no_table_of_cases_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "cases.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match="identity"):
+        read_cases(tmp_path)
+    with pytest.raises(InputError, match="no such table"):
+        read_cases(tmp_path / "none")
+
+
+def test_comparing_counts_failures_as_losses_and_round_off_as_nothing() -> None:
+    old = cases([result("a", 1, 1e-15), result("b", 1, 0.1), result("c", 1, 0.1), result("d", 1, None, "failed")])
+    new = cases([result("a", 1, 1e-12), result("b", 1, 0.25), result("c", 1, None, "timeout"), result("d", 1, 0.5)])
+    found = compare(old, new, factor=2.0)
+    assert [row.split(" | ")[2] for row in found.worse["case"]] == ["b", "c"]
+    assert [row.split(" | ")[2] for row in found.better["case"]] == ["d"]
+    assert found.same == 1
+    assert not len(compare(old, old).worse)
+
+
+def test_comparing_names_cases_that_only_one_side_has() -> None:
+    found = compare(
+        cases([result("a", 1, 0.1), result("a", 2, 0.1)]), cases([result("a", 2, 0.1), result("a", 3, 0.1)])
+    )
+    assert [name.split("seed ")[1] for name in found.gone] == ["1"]
+    assert [name.split("seed ")[1] for name in found.fresh] == ["3"]
+
+
+def test_the_provenance_names_no_path_and_no_host() -> None:
+    import platform
+
+    text = str(ABOUT)
+    assert platform.node() not in text or len(platform.node()) < 4
+    assert str(Path.home()) not in text
+    assert ABOUT["versions"]["numpy"] == np.__version__
