@@ -334,7 +334,7 @@ def run(
         raise
     if tally.ran or not store.about():
         seeds = sorted({case.seed for case in loaded.cases})
-        store.put_about(describe(command_line(), seeds, jobs=jobs, suite=loaded.name, methods=_contestants(loaded)))
+        store.put_about(describe(command_line(), seeds, jobs=jobs, suite=loaded.name, settings=_contestants(loaded)))
     if as_json:
         print(_cases_json(found))
         return

@@ -94,8 +94,10 @@ def lines(about: Mapping[str, Any]) -> list[str]:
     """Write a description as lines of text, for the head of a file."""
     written = []
     for name, value in about.items():
+        if value in ({}, [], ""):
+            continue
         if isinstance(value, Mapping):
-            value = ", ".join(f"{key} {entry}" for key, entry in value.items())
+            value = "; ".join(f"{key} {entry}" for key, entry in value.items())
         elif isinstance(value, (list, tuple)):
             value = ", ".join(str(entry) for entry in value)
         written.append(f"{name}: {value}")

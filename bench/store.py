@@ -35,12 +35,12 @@ class Store:
         return self.path(key).is_file()
 
     def put(self, key: str, result: dict[str, Any]) -> None:
-        """Keep a result at once.
+        """Keep a result at once; the order of its terms is that of the library.
 
         Raises:
             InputError: it cannot be written (a full disk); earlier results stay as they are.
         """
-        write_text(self.path(key), json.dumps(result, allow_nan=False, sort_keys=True) + "\n")
+        write_text(self.path(key), json.dumps(result, allow_nan=False) + "\n")
 
     def get(self, key: str) -> dict[str, Any]:
         """Read a result.

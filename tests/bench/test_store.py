@@ -21,6 +21,13 @@ def test_what_is_put_comes_back(tmp_path: Path) -> None:
     assert create(tmp_path / "store").all() == [{"status": "ok", "e2": 1e-17}]
 
 
+def test_terms_keep_the_order_of_their_library(tmp_path: Path) -> None:
+    store = create(tmp_path / "store")
+    found = {"u[n+1]": 1.0, "u[n-1]": 2.0, "abs(u[n])": 3.0}
+    store.put("abc", {"coefficients": found})
+    assert list(store.get("abc")["coefficients"]) == list(found)
+
+
 def test_a_store_of_another_version_is_refused_with_the_remedy(tmp_path: Path) -> None:
     store = create(tmp_path / "store")
     (store.folder / "store.json").write_text('{"version": 99}')
