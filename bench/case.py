@@ -16,6 +16,7 @@ import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -117,12 +118,10 @@ def samples(case: Case, base: Path) -> list[SimulatedSamples]:
     )  # fmt: skip
     draw = np.random.default_rng(seed_of(case.seed, "noise"))
     noisy = [observe(one, draw, noise=case.noise, missing=case.missing) for one in clean]
-    if not case.known_ends:
-        return noisy
-    import dataclasses
-
-    system, _ = case.resolve(base)
-    return [dataclasses.replace(one, ends=case.ends or system.ends) for one in noisy]
+    if case.known_ends:
+        system, _ = case.resolve(base)
+        noisy = [replace(one, ends=case.ends or system.ends) for one in noisy]
+    return [face for one in noisy for face in ((one, one.mirrored()) if case.mirror else (one,))]
 
 
 def _stamp(system: str, base: Path) -> int:

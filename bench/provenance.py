@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import platform
+import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("latticebench", "numpy", "scipy", "pysindy", "torch", "sympy", "pandas")
+DISTRIBUTION = "latticebench"
 
 
 def describe(command: Sequence[str], seeds: Sequence[int] = (), **more: Any) -> dict[str, Any]:
@@ -80,13 +81,18 @@ def machine() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Give the versions of Python and of the packages that figures depend on."""
+    """Give the versions of Python, of this package, and of the packages that it needs."""
     found = {"python": platform.python_version()}
-    for package in PACKAGES:
+    try:
+        needed = [line for line in metadata.requires(DISTRIBUTION) or () if "extra ==" not in line]
+    except metadata.PackageNotFoundError:
+        return {**found, DISTRIBUTION: "not installed"}
+    for name in (DISTRIBUTION, *(re.split(r"[^\w.-]", line)[0] for line in needed)):
         try:
-            found[package] = metadata.version(package)
+            found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[package] = "not installed"
+            # Some are needed on other systems only.
+            continue
     return found
 
 

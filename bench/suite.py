@@ -57,7 +57,9 @@ class Case(_Model):
         seed: chooses noise, gaps and uneven times (the same for every method) and, apart from that, the method's draws.
         library: its name.
         terms: the library's terms, where they are not one of the system's.
+        mirror: show the samples of -u, too, as a further trajectory.
         label, method, settings: who fits it.
+        part: the part of the suite that it belongs to, such as a panel of a figure.
         time_limit: seconds; memory_limit: MiB.
     """
 
@@ -75,19 +77,23 @@ class Case(_Model):
     trajectories: pydantic.PositiveInt = 1
     noise: Annotated[float, pydantic.Field(ge=0, allow_inf_nan=False)] = 0.0
     missing: Annotated[float, pydantic.Field(ge=0, lt=1)] = 0.0
+    mirror: bool = False
     seed: pydantic.NonNegativeInt = 1
     library: str
     terms: tuple[str, ...] = ()
     label: str
     method: str
     settings: dict[str, Any] = {}
+    part: str = ""
     time_limit: pydantic.PositiveFloat = 120.0
     memory_limit: pydantic.PositiveInt = 4096
 
     @property
     def identity(self) -> str:
         """The settings that decide the result, as text in a fixed order: what two runs of one case have in common."""
-        content = self.model_dump(mode="json", exclude={"label", "time_limit", "memory_limit"}, exclude_defaults=True)
+        content = self.model_dump(
+            mode="json", exclude={"label", "part", "time_limit", "memory_limit"}, exclude_defaults=True
+        )
         return json.dumps(content, sort_keys=True)
 
     @property
@@ -111,6 +117,7 @@ class Case(_Model):
                 ("uneven", self.uneven),
                 ("only u", not self.velocities),
                 ("known ends", self.known_ends),
+                ("with -u", self.mirror),
             )
             if said
         ]
@@ -148,6 +155,7 @@ class _Contestant(_Model):
 class _Grid(_Model):
     """A block of a suite: every list is an axis. The keys are those of `Case`, in the plural where a list is usual."""
 
+    part: str = ""
     system: str
     parameters: dict[str, Annotated[list[Number], pydantic.BeforeValidator(_listed)]] = {}
     libraries: list[str] = []
@@ -164,6 +172,7 @@ class _Grid(_Model):
     trajectories: Annotated[list[int], pydantic.BeforeValidator(_listed)] = [1]
     noise: Annotated[list[float], pydantic.BeforeValidator(_listed)] = [0.0]
     missing: Annotated[list[float], pydantic.BeforeValidator(_listed)] = [0.0]
+    mirror: Annotated[list[bool], pydantic.BeforeValidator(_listed)] = [False]
     seeds: Annotated[list[int], pydantic.BeforeValidator(_listed)] = [1]
     methods: list[str] | None = None
     time_limit: float = 120.0
@@ -179,7 +188,7 @@ class _File(_Model):
 
 AXES = (
     "initial", "sites", "ends", "integrator", "samples", "span", "uneven", "velocities", "known_ends", "trajectories",
-    "noise", "missing",
+    "noise", "missing", "mirror",
 )  # fmt: skip
 
 
@@ -278,6 +287,6 @@ def _expand(grid: _Grid, contestants: dict[str, _Contestant], where: str) -> Ite
                 yield Case(
                     system=grid.system, parameters=dict(zip(parameter_names, parameters, strict=True)),
                     **dict(zip(AXES, axes, strict=True)), seed=seed, library=name, terms=terms, label=label,
-                    method=contestants[label].method, settings=contestants[label].settings,
+                    method=contestants[label].method, settings=contestants[label].settings, part=grid.part,
                     time_limit=grid.time_limit, memory_limit=grid.memory_limit,
                 )  # fmt: skip

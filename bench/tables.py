@@ -20,6 +20,8 @@ SCORES = (
     "seconds", "cpu_seconds", "peak_mib",
 )  # fmt: skip
 FORMATS = ("csv", "md", "tex")
+# What a row of the matrix is about; a column of it is a method.
+ABOUT = ["part", "data", "library"]
 
 
 def cases(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -32,13 +34,25 @@ def cases(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         case = Case.model_validate(result["case"])
         rows.append(
             {
-                "data": case.data, "library": case.library, "method": case.label, "noise": case.noise, "seed": case.seed,
-                "status": result["status"],
+                "part": case.part, "data": case.data, "library": case.library, "method": case.label, "noise": case.noise,
+                "seed": case.seed, "status": result["status"],
                 **{name: _number(result[name]) for name in SCORES},
                 "reason": result["reason"] or result["note"], "settings": _settings(case.settings), "identity": case.identity,
             }
         )  # fmt: skip
-    columns = ["data", "library", "method", "noise", "seed", "status", *SCORES, "reason", "settings", "identity"]
+    columns = [
+        "part",
+        "data",
+        "library",
+        "method",
+        "noise",
+        "seed",
+        "status",
+        *SCORES,
+        "reason",
+        "settings",
+        "identity",
+    ]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -52,12 +66,12 @@ def coefficients(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
             stderr = np.nan if result["stderr"] is None else _number(result["stderr"][term])
             rows.append(
                 {
-                    "data": case.data, "library": case.library, "method": case.label, "noise": case.noise,
-                    "seed": case.seed, "term": term, "coefficient": value, "truth": truth, "error": value - truth,
+                    "part": case.part, "data": case.data, "library": case.library, "method": case.label,
+                    "noise": case.noise, "seed": case.seed, "term": term, "coefficient": value, "truth": truth, "error": value - truth,
                     "stderr": stderr,
                 }
             )  # fmt: skip
-    columns = ["data", "library", "method", "noise", "seed", "term", "coefficient", "truth", "error", "stderr"]
+    columns = ["part", "data", "library", "method", "noise", "seed", "term", "coefficient", "truth", "error", "stderr"]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -68,45 +82,47 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     figure. `ok` counts the cases that ended with a fit.
     """
     if table.empty:
-        return pd.DataFrame(columns=["data", "library", "method"])
+        return pd.DataFrame(columns=[*ABOUT, "method"])
     counted = table.copy()
     missed = ~counted["status"].isin(["ok", "skipped"])
     # Where fits ended and yet none has an E2, there is no truth.
-    ended = (counted["status"] == "ok").groupby([counted["data"], counted["library"]]).transform("any")
-    no_truth = ended & counted.groupby(["data", "library"])["e2"].transform(lambda e: bool(e.isna().all()))
+    ended = (counted["status"] == "ok").groupby([counted[name] for name in ABOUT]).transform("any")
+    no_truth = ended & counted.groupby(ABOUT)["e2"].transform(lambda e: bool(e.isna().all()))
     counted.loc[missed & ~no_truth, ["e2", "einf", "forecast_error"]] = np.inf
     counted.loc[missed, ["tpr", "forecast_horizon"]] = 0.0
-    order = counted.drop_duplicates(["data", "library", "method"]).reset_index(drop=True)
-    grouped = counted.groupby(["data", "library", "method"], sort=False)
+    grouped = counted.groupby([*ABOUT, "method"], sort=False)
     found = grouped[[*SCORES]].median()
     found.insert(0, "ok", grouped["status"].agg(lambda s: f"{int((s == 'ok').sum())}/{len(s)}"))
-    keys = pd.MultiIndex.from_frame(order[["data", "library", "method"]])
+    keys = pd.MultiIndex.from_frame(counted[[*ABOUT, "method"]].drop_duplicates())
     return found.reindex(keys).reset_index()
 
 
 def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
-    """Arrange the summary as data and library against method; a cell without a figure says why."""
+    """Arrange the summary as part, data and library against method; a cell without a figure says why."""
     short = summary(table)
-    reasons = table.drop_duplicates(["data", "library", "method"]).set_index(["data", "library", "method"])["status"]
-    cells = {}
-    for _, row in short.iterrows():
-        key = (row["data"], row["library"], row["method"])
-        status = reasons[key]
-        shown = format_number(row[value])
-        if not shown:
-            # Where the equation is outside the library, what it leaves of the derivative is all there is to say.
-            left = format_number(row["residual"])
-            shown = status if status != "ok" else (f"no truth, leaves {left}" if left else "no truth")
-        cells[key] = shown
-    wide = pd.Series(cells).unstack() if cells else pd.DataFrame()
-    if wide.empty:
-        return wide
-    wide = wide.reindex(
-        index=pd.MultiIndex.from_frame(short[["data", "library"]].drop_duplicates()),
-        columns=list(dict.fromkeys(short["method"])),
-    )
-    wide.index.names = ["data", "library"]
-    return wide.fillna("").reset_index()
+    if short.empty:
+        return pd.DataFrame(columns=ABOUT)
+    status = table.drop_duplicates([*ABOUT, "method"])["status"].tolist()
+
+    def shown(row: pd.Series, state: str) -> str:
+        figure = format_number(row[value])
+        if figure or state != "ok":
+            return figure or state
+        # Where the equation is outside the library, what it leaves of the derivative is all there is to say.
+        left = format_number(row["residual"])
+        return f"no truth, leaves {left}" if left else "no truth"
+
+    short["cell"] = [shown(row, state) for (_, row), state in zip(short.iterrows(), status, strict=True)]
+    wide = short.pivot(index=ABOUT, columns="method", values="cell")
+    rows = pd.MultiIndex.from_frame(short[ABOUT].drop_duplicates())
+    wide = wide.reindex(index=rows, columns=list(dict.fromkeys(short["method"]))).fillna("").reset_index()
+    wide.columns.name = None
+    return _without_empty(wide)
+
+
+def _without_empty(frame: pd.DataFrame) -> pd.DataFrame:
+    """Leave the column of parts out where the suite has none."""
+    return frame.drop(columns="part") if "part" in frame and not frame["part"].astype(bool).any() else frame
 
 
 def format_number(value: Any) -> str:
@@ -147,7 +163,7 @@ def render(frame: pd.DataFrame, about: Mapping[str, Any], form: str) -> str:
     head = lines(about)
     if form == "csv":
         return "".join(f"# {line}\n" for line in head) + frame.to_csv(index=False)
-    readable = frame.drop(columns=[name for name in ("identity", "settings") if name in frame])
+    readable = _without_empty(frame.drop(columns=[name for name in ("identity", "settings") if name in frame]))
     for name in readable.columns:
         if pd.api.types.is_float_dtype(readable[name]):
             readable[name] = [format_number(value) for value in readable[name]]

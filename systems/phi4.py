@@ -26,7 +26,10 @@ SYSTEM = System(
         "kink": Initial(
             u="tanh(x/sqrt(1-v**2))",
             v="-v/sqrt(1-v**2)/cosh(x/sqrt(1-v**2))**2",
-        )
+        ),
+        # Two states of this project's, to see what the number of sites in motion does: few of them, and all.
+        "kick": Initial(u="1", v="exp(-x**2)"),
+        "wave": Initial(u="cos(pi*x/4)/2"),
     },
     libraries=(
         library("lib1", "u[n+1]+u[n-1]-2*u[n]; (u[n+1]-u[n-1])/2; u[n]; u[n]**3", "paper, Lib(1)"),

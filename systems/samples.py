@@ -138,6 +138,21 @@ class SimulatedSamples(Samples):
     rate: Float[ndarray, "time sites"] | None = None
     noise: float = 0.0
 
+    def mirrored(self) -> SimulatedSamples:
+        """Give the samples of -u with their truth.
+
+        Raises:
+            InputError: the equation is not odd, so that -u is no solution of it.
+        """
+        if Term(self.equation).parity != -1:
+            raise InputError(
+                f"{self.source}: the equation is not odd, so that -u does not solve it; leave the mirrored data out"
+            )
+        mirrored = super().mirrored()
+        assert isinstance(mirrored, SimulatedSamples)
+        exact = None if self.exact is None else self.exact.mirrored()
+        return replace(mirrored, exact=exact, rate=None if self.rate is None else -self.rate)
+
     def observed(self) -> Samples:
         """Give what an experiment would have: no truth, and no word on the noise."""
         return Samples(self.t, self.u, self.v, self.f, None, self.source, self.ends)
@@ -306,7 +321,9 @@ def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Sample
                 f"{source}: row {row + 1}, column {column}: {str(table[column].iloc[row])[:40]!r} is not a number; "
                 "leave the cell empty if the value is missing"
             )
-        numbers[column] = values.to_numpy(dtype=float)
+        # pandas reads numbers in texts fast, but not to the last digit; Python does.
+        exact = table[column].where(values.notna(), np.nan)
+        numbers[column] = np.array([float(value) for value in exact])
 
     def block(prefix: str) -> np.ndarray | None:
         found = sorted(int(c[len(prefix) :]) for c in columns if re.fullmatch(rf"{prefix}\d+", c))

@@ -46,4 +46,4 @@ def test_the_error_of_a_case_has_not_grown(number: int, tables: tuple[pd.DataFra
 def test_a_worse_method_would_be_noticed(tables: tuple[pd.DataFrame, pd.DataFrame]) -> None:
     old, new = tables
     spoiled = new.assign(e2=new["e2"].clip(lower=1e-9) * 3, residual=new["residual"] * 3)
-    assert len(compare(old, spoiled, FACTOR).worse) == len(new)
+    assert len(compare(old, spoiled, FACTOR).worse) == int((new["status"] == "ok").sum())

@@ -40,7 +40,7 @@ class Hostile:
         if self.deed == "eat":
             eaten = []
             while True:
-                eaten.append(np.ones(2**22))
+                eaten.append(np.ones(2**25))
         if self.deed == "hang in C":
             ctypes.PyDLL(None).sleep(600)  # holds the interpreter's lock
         if self.deed == "die":

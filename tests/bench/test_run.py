@@ -45,7 +45,7 @@ def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other
             "good": 'deed = "behave"', "failing": 'deed = "fail"', "eating": 'deed = "eat"',
             "hanging": 'deed = "hang in C"', "dying": 'deed = "die"', "empty": 'deed = "nan"', "slow": "seconds = 0.5",
         },
-        seeds="[1, 2]", limits="time_limit = 4\nmemory_limit = 1500",
+        seeds="[1, 2]", limits="time_limit = 8\nmemory_limit = 1500",
     )  # fmt: skip
     results, tally = run(suite, create(tmp_path / "store"), jobs=2)
     found = {(r["case"]["label"], r["case"]["seed"]): r for r in results}
@@ -57,7 +57,7 @@ def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other
         assert found["eating", seed]["status"] == "memory"
         assert "1500 MiB" in found["eating", seed]["reason"]
         assert found["hanging", seed]["status"] == "timeout"
-        assert "4 s" in found["hanging", seed]["reason"]
+        assert "8 s" in found["hanging", seed]["reason"]
         assert found["dying", seed]["status"] == "died"
         assert found["empty", seed]["status"] == "failed"
         assert "not finite" in found["empty", seed]["reason"]

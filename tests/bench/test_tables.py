@@ -74,6 +74,14 @@ def test_numbers_have_two_digits(value: float, text: str) -> None:
     assert format_number(value) == text
 
 
+def test_parts_of_a_suite_are_told_apart() -> None:
+    first, second = result("a", 1, 0.1), result("a", 1, 0.2)
+    second["case"]["part"] = "panel (1a)"
+    wide = matrix(cases([first, second]))
+    assert list(wide["part"]) == ["", "panel (1a)"]
+    assert list(wide["a"]) == ["0.1", "0.2"]
+
+
 def test_what_is_published_can_be_read_and_carries_where_it_comes_from(tmp_path: Path) -> None:
     paths = publish(RESULTS, ABOUT, tmp_path)
     assert len(paths) == 12

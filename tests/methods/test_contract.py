@@ -169,3 +169,12 @@ def test_with_known_ends_every_site_counts_so_that_a_chain_of_two_can_be_fitted(
     np.testing.assert_allclose(fit.coefficients, [1.0, -2.0], atol=1e-4)
     with pytest.raises(InputError, match="say how the chain ends"):
         solve(methods.find("least-squares")(), [Samples(times, u)], library("chain", "u[n+1]+u[n-1]; u[n]"), 2, seed=1)
+
+
+def test_the_mirror_image_of_an_odd_equation_has_the_same_truth_and_another_has_none(phi4: SimulatedSamples) -> None:
+    mirrored = phi4.mirrored()
+    assert np.array_equal(mirrored.u, -phi4.u)
+    fit = solve(methods.find("oracle")(), [mirrored], systems.find("phi4").library("lib2"), 2, seed=1)
+    np.testing.assert_allclose(fit.coefficients, [2, 2, -2, -2], rtol=1e-10)
+    with pytest.raises(InputError, match="not odd"):
+        dataclasses.replace(phi4, equation="u[n]**2").mirrored()
