@@ -8,8 +8,10 @@ from __future__ import annotations
 import json
 import math
 import os
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -276,12 +278,16 @@ def fit(
         order = known.order
     data = read_all(files, ends)
     try:
-        with waiting(f"{method}: fitting {len(candidates.terms)} terms"):
+        with waiting(f"{method}: fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
             found = solve(chosen, data, candidates, order, seed)
     except Skipped as reason:
         raise InputError(
             f"method {method!r} cannot fit {data[0].source}: {reason}; choose another with --method"
         ) from None
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{data[0].source}: method {method!r} failed: {type(error).__name__}: {error}") from error
     content = json.dumps(_fit_json(found), indent=2, allow_nan=False) + "\n"
     if json_out == "-":
         print(content, end="")
@@ -325,20 +331,25 @@ def run(
     folder = results if results is not None else Path("runs") / loaded.name
     store = create(folder)
     jobs = jobs or os.cpu_count() or 1
+    about = {
+        "command": " ".join(["latticebench", *command_line()]), "suite": loaded.name, "jobs": jobs,
+        "settings": _contestants(loaded),
+    }  # fmt: skip
+    # A cluster that ends a job says so first; that is the same as Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with progress_bar(len(loaded.cases)) as watcher:
-            found, tally = run_suite(loaded, store, jobs=jobs, retry=retry, watcher=watcher)
+            found, tally = run_suite(loaded, store, jobs=jobs, retry=retry, watcher=watcher, about=about)
     except KeyboardInterrupt:
-        done = sum(1 for _ in store.paths())
-        print(f"stopped; {done} results are in {folder}; the same command continues from there", file=sys.stderr)
+        print(
+            f"stopped; {len(store.all())} results are in {folder}; the same command continues from there",
+            file=sys.stderr,
+        )
         raise
-    if tally.ran or not store.about():
-        seeds = sorted({case.seed for case in loaded.cases})
-        store.put_about(describe(command_line(), seeds, jobs=jobs, suite=loaded.name, settings=_contestants(loaded)))
     if as_json:
         print(_cases_json(found))
         return
-    show_results(found, store.about(), loaded.title)
+    show_results(found, describe(found, store.about()), loaded.title)
     statuses = ", ".join(f"{count} {status}" for status, count in sorted(tally.statuses.items()))
     print(f"{len(found)} cases ({statuses}); {tally.ran} run now, {tally.reused} were there; kept in {folder}")
 
@@ -351,6 +362,7 @@ def table(
     as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
 ) -> None:
     """Show the results of a run as a table, and publish them."""
+    from bench.provenance import describe
     from bench.screen import show_results
     from bench.store import open_store
     from bench.tables import SCORES, publish
@@ -364,9 +376,9 @@ def table(
     if as_json:
         print(_cases_json(found))
     else:
-        show_results(_ordered(found), store.about(), "", value)
+        show_results(found, describe(found, store.about()), "", value)
     if out is not None:
-        for path in publish(_ordered(found), store.about(), out):
+        for path in publish(found, describe(found, store.about()), out):
             print(path, file=sys.stderr if as_json else sys.stdout)
 
 
@@ -377,13 +389,14 @@ def figures(
 ) -> None:
     """Draw the results of a run: coefficients against iteration, errors, error against time and noise."""
     from bench.figures import draw_all
+    from bench.provenance import describe
     from bench.store import open_store
 
     store = open_store(folder)
-    found = _ordered(store.all())
+    found = store.all()
     if not found:
         raise InputError(f"{folder}: there are no results in it yet; run a suite with --results {folder}")
-    for path in draw_all(found, store.about(), out if out is not None else folder / "figures"):
+    for path in draw_all(found, describe(found, store.about()), out if out is not None else folder / "figures"):
         print(path)
 
 
@@ -461,31 +474,19 @@ def _cases_json(results: Sequence[Mapping[str, Any]]) -> str:
     return json.dumps(_jsonable(cases(results).to_dict("records")), indent=2)
 
 
-def _ordered(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Put results into an order that does not depend on their keys."""
-
-    def place(result: dict[str, Any]) -> tuple[Any, ...]:
-        case = result["case"]
-        return (
-            case["system"],
-            str(case["parameters"]),
-            str(case["initial"]),
-            case["library"],
-            case["noise"],
-            case["label"],
-            case["seed"],
-        )
-
-    return sorted(results, key=place)
-
-
 def _contestants(suite: Suite) -> dict[str, str]:
-    """Say what each label of a suite stands for, with its settings."""
-    return {
-        case.label: ", ".join([case.method, *(f"{name}={value}" for name, value in case.settings.items())])
-        for case in suite.cases
-        if case.settings or case.method != case.label
-    }
+    """Say what each label of a suite stands for, with all its settings."""
+    import methods
+    from methods.method import make, settings
+
+    written = {}
+    for case in suite.cases:
+        if case.label not in written:
+            kind = methods.find(case.method, suite.base)
+            chosen = make(kind, case.settings)
+            values = {name: getattr(chosen, name) for name in settings(kind)}
+            written[case.label] = ", ".join([case.method, *(f"{n}={v}" for n, v in values.items() if v is not None)])
+    return written
 
 
 if __name__ == "__main__":

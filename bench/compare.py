@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from systems.errors import InputError
+
 # Round-off differs between machines; errors below this are all the same.
 FLOOR = 1e-9
 FACTOR = 2.0
@@ -31,7 +33,12 @@ def compare(old: pd.DataFrame, new: pd.DataFrame, factor: float = FACTOR, floor:
 
     A case is worse when its E2 (without a truth: its residual) has grown by more than `factor`, both counted as at least
     `floor`, or when it had a fit and has none any more.
+
+    Raises:
+        InputError: no case is in both.
     """
+    if not set(old["identity"]) & set(new["identity"]):
+        raise InputError("the two tables have no case in common; compare runs of the same suite")
     before, after = (table.drop_duplicates("identity").set_index("identity") for table in (old, new))
     worse, better, same = [], [], 0
     for identity in before.index:
@@ -64,17 +71,15 @@ def compare(old: pd.DataFrame, new: pd.DataFrame, factor: float = FACTOR, floor:
 
 
 def _error(a: pd.Series, b: pd.Series) -> tuple[float, float]:
-    """Give both errors by the same measure; one that has no fit is infinite, one that was skipped does not count."""
+    """Give both errors by the same measure; one that has no fit, be it skipped, is infinite."""
     measure = "residual" if pd.isna(a["e2"]) and pd.isna(b["e2"]) else "e2"
 
     def one(row: pd.Series) -> float:
-        if row["status"] == "skipped":
-            return 0.0
         value = row.get(measure, np.nan)
         return float(value) if row["status"] == "ok" and not pd.isna(value) else np.inf
 
     first, second = one(a), one(b)
-    # Two failures are no change, and so are two skips.
+    # Two failures are no change.
     return (1.0, 1.0) if first == second == np.inf else (first, second)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Sequence
 
 from methods.method import Fit
@@ -21,14 +22,16 @@ def side(texts: Sequence[str], values: Sequence[float], digits: int = 4) -> str:
             continue
         sign = "-" if value < 0 else "+"
         bare = f"{abs(value):.{digits}g}"
-        factor = text if not _is_sum(text) else f"({text})"
-        parts.append(f"{sign} {bare}" if text == "1" else f"{sign} {bare} {factor}")
+        factor = text if _is_product(text) else f"({text})"
+        parts.append(f"{sign} {bare}" if text == "1" else f"{sign} {bare}*{factor}")
     return " ".join(parts).removeprefix("+ ") or "0"
 
 
-def _is_sum(text: str) -> bool:
-    """Say whether a term needs brackets behind a factor."""
-    import ast
-
-    tree = ast.parse(text, mode="eval").body
-    return isinstance(tree, ast.BinOp) and isinstance(tree.op, (ast.Add, ast.Sub))
+def _is_product(text: str) -> bool:
+    """Say whether a term can stand behind a factor without brackets."""
+    tree = ast.parse(text.strip(), mode="eval").body
+    while isinstance(tree, ast.BinOp) and isinstance(tree.op, (ast.Mult, ast.Div)):
+        tree = tree.left
+    if isinstance(tree, ast.BinOp):
+        return isinstance(tree.op, ast.Pow)
+    return not isinstance(tree, (ast.UnaryOp, ast.Constant))

@@ -43,7 +43,7 @@ def draw_all(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], fol
     if table["e2"].notna().any():
         written.append(_save(errors(table), folder / "errors.png", about))
         written.append(_save(error_against_seconds(table), folder / "error-against-seconds.png", about))
-        if table.groupby(["data", "library", "method"])["noise"].count().size and table["noise"].nunique() > 1:
+        if table["noise"].nunique() > 1:
             written.append(_save(error_against_noise(table), folder / "error-against-noise.png", about))
     return written
 
@@ -103,7 +103,7 @@ def errors(table: pd.DataFrame) -> Figure:
     axes.set_yticks(range(len(rows)), [f"{data}   {library}" for data, library in rows], fontsize=8)
     axes.invert_yaxis()
     axes.grid(axis="both", alpha=0.25)
-    axes.set_xlabel("relative error of the coefficients, E2 (median over seeds)")
+    axes.set_xlabel(f"relative error of the coefficients, E2 (median over seeds; below {LOWEST:.0e}: round-off)")
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
     return figure
 
@@ -134,7 +134,8 @@ def error_against_noise(table: pd.DataFrame) -> Figure:
     known = table[table["e2"].notna() | ~table["status"].isin(["ok", "skipped"])].copy()
     known["system"] = known["data"].str.replace(r" noise=\S+", "", regex=True)
     known.loc[known["e2"].isna(), "e2"] = np.inf
-    panels = list(dict.fromkeys(zip(known["system"], known["library"], strict=True)))
+    levels = known.groupby(["system", "library"])["noise"].nunique()
+    panels = [pair for pair in dict.fromkeys(zip(known["system"], known["library"], strict=True)) if levels[pair] > 1]
     across = min(len(panels), 3)
     down = -(-len(panels) // across)
     figure, grid = plt.subplots(down, across, figsize=(4.2 * across, 3.4 * down), squeeze=False, layout="constrained")

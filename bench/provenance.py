@@ -16,23 +16,29 @@ from typing import Any
 DISTRIBUTION = "latticebench"
 
 
-def describe(command: Sequence[str], seeds: Sequence[int] = (), **more: Any) -> dict[str, Any]:
-    """Describe a run: a flat dictionary of texts, numbers and lists.
+def origin() -> dict[str, Any]:
+    """Describe what computes a result: commit, date, machine and versions."""
+    date = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d")
+    return {"commit": commit(), "date": date, "machine": machine(), "versions": versions()}
+
+
+def describe(results: Sequence[Mapping[str, Any]], run: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe where results come from: a flat dictionary of texts, numbers and lists.
 
     Args:
-        command: the arguments after `latticebench`.
-        seeds: what the random draws were seeded with.
-        more: further entries.
+        results: with their origins in `made`; where these differ, all are named.
+        run: the command and what else was written down when the suite was run last.
     """
-    return {
-        "command": " ".join(["latticebench", *command]),
-        "commit": commit(),
-        "date": datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d"),
-        "machine": machine(),
-        "versions": versions(),
-        "seeds": sorted(set(seeds)),
-        **more,
-    }
+    described: dict[str, Any] = {name: value for name, value in run.items() if name != "keys"}
+    for name in ("commit", "date", "machine"):
+        described[name] = sorted({str(result["made"][name]) for result in results})
+    packages: dict[str, set[str]] = {}
+    for result in results:
+        for package, version in result["made"]["versions"].items():
+            packages.setdefault(package, set()).add(version)
+    described["versions"] = {package: " and ".join(sorted(found)) for package, found in packages.items()}
+    described["seeds"] = sorted({int(result["case"]["seed"]) for result in results})
+    return described
 
 
 def commit() -> str:

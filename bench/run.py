@@ -11,13 +11,14 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from bench.case import blank, run_case
+from bench.provenance import origin
 from bench.store import Store
 from bench.suite import Case, Suite
 
@@ -25,6 +26,7 @@ ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
 )
 POLL = 0.1
+START_LIMIT = 120.0
 # A worker that died may have been the victim of something else; its case gets a second chance.
 TRIES = 2
 
@@ -52,7 +54,13 @@ class Tally:
 
 
 def run(
-    suite: Suite, store: Store, *, jobs: int, retry: bool = False, watcher: Watcher | None = None
+    suite: Suite,
+    store: Store,
+    *,
+    jobs: int,
+    retry: bool = False,
+    watcher: Watcher | None = None,
+    about: Mapping[str, Any] | None = None,
 ) -> tuple[list[dict[str, Any]], Tally]:
     """Run the cases of a suite that have no result yet, and give all results in the suite's order.
 
@@ -62,6 +70,7 @@ def run(
         jobs: worker processes.
         retry: run failed cases again.
         watcher: is told of every case.
+        about: the command and what else to write down of the run.
 
     Raises:
         InputError: a result cannot be written.
@@ -69,6 +78,8 @@ def run(
     """
     keys = {case.identity: case.key(suite.base) for case in suite.cases}
     tally = Tally()
+    store.put_about({**(about or {}), "keys": list(keys.values())})
+    made = origin()
     _forget_superseded(store, suite, set(keys.values()))
 
     def done(case: Case) -> bool:
@@ -81,7 +92,7 @@ def run(
         watcher.count(len(waiting))
 
     def keep(case: Case, result: dict[str, Any]) -> None:
-        store.put(keys[case.identity], result)
+        store.put(keys[case.identity], {**result, "made": made})
         tally.ran += 1
         if watcher is not None:
             watcher.finished(case, result)
@@ -190,9 +201,16 @@ class _Slot:
             self.executor = ProcessPoolExecutor(
                 max_workers=1, env=ONE_THREAD, initializer=_follow_runner, initargs=(os.getpid(),)
             )
-            self.worker = self.executor.submit(os.getpid).result()
         self.case, self.attempt, self.since = case, attempt, time.monotonic()
-        self.future = self.executor.submit(run_case, case, base)
+        try:
+            if not self.worker:
+                self.worker = self.executor.submit(os.getpid).result(timeout=START_LIMIT)
+                self.since = time.monotonic()
+            self.future = self.executor.submit(run_case, case, base)
+        except (RuntimeError, OSError, TimeoutError) as error:
+            # A worker that cannot start is a worker that died.
+            self.future = Future()
+            self.future.set_exception(error)
 
     def result(self) -> dict[str, Any] | None:
         """Give the case's result when there is one, be it that a limit was passed; None while it runs."""
@@ -229,9 +247,11 @@ class _Slot:
         self.future = None
         if self.executor is not None:
             executor, self.executor = self.executor, None
+            worker, self.worker = self.worker, 0
             # First the process itself: the executor's own way waits for a lock that a stuck worker may hold.
-            with contextlib.suppress(psutil.Error):
-                psutil.Process(self.worker).kill()
+            if worker:
+                with contextlib.suppress(psutil.Error):
+                    psutil.Process(worker).kill()
             executor.shutdown(wait=True, kill_workers=True)
 
 

@@ -57,7 +57,11 @@ def show_fit(fit: Fit) -> None:
         columns.append("standard error")
         rows = [[*row, f"{error:.2g}"] for row, error in zip(rows, fit.stderr, strict=True)]
     show_rows(columns, rows)
-    left = "" if fit.residual != fit.residual else f"; {100 * fit.residual:.3g} % of the derivative is left"
+    left = (
+        ""
+        if fit.residual != fit.residual
+        else f"; {100 * fit.residual:.3g} % of the derivative is left, its noise included"
+    )
     for line in (written(fit), f"{fit.method}: {fit.status}{left}; {fit.seconds:.2f} s"):
         console().print(line, highlight=False, markup=False, soft_wrap=True)
 
@@ -106,16 +110,17 @@ class Bar:
 
     def started(self, case: Case) -> None:
         """Show a case as running."""
-        self.running.append(case.title)
+        self.running = [*(title for title in self.running if title != case.title), case.title]
         self._name_running()
 
     def finished(self, case: Case, result: dict[str, Any]) -> None:
         """Count a case, and say what went wrong with it."""
-        if case.title in self.running:
-            self.running.remove(case.title)
-        if result["status"] not in ("ok", "skipped"):
-            line = f"{result['status']}: {case.title}: {result['reason']}"
-            self.progress.console.print(line, markup=False, highlight=False)
+        self.running = [title for title in self.running if title != case.title]
+        # Without a terminal there is no bar, and silence would look like a standstill.
+        if result["status"] not in ("ok", "skipped") or not self.progress.console.is_terminal:
+            reason = f": {result['reason']}" if result["reason"] else ""
+            line = f"{result['status']}: {case.title}{reason}"
+            self.progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
         self.progress.advance(self.task)
         self._name_running()
 

@@ -1,6 +1,7 @@
 """The store of results: a folder with one JSON file a finished case.
 
     DIR/store.json           which version of the store's form this is
+    DIR/run.json             the suite that was run last: command, settings, and the keys of its cases in their order
     DIR/cases/KEY.json       one result; KEY is `Case.key`
 
 A file appears whole or not at all (written beside its place, synced, renamed), so that a killed run or two runs at once can lose
@@ -14,10 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pydantic
+
+from bench.case import blank
+from bench.suite import Case
 from systems.errors import InputError
 from systems.files import write_text
 
 VERSION = 1
+RESULT = blank(Case.model_construct()).keys() | {"made"}
 
 
 @dataclass(frozen=True)
@@ -46,17 +52,26 @@ class Store:
         """Read a result.
 
         Raises:
-            InputError: the file is not a result.
+            InputError: the file is not a result of this version.
         """
-        return _read(self.path(key))
+        path = self.path(key)
+        result = _read(path)
+        try:
+            Case.model_validate(result.get("case"))
+        except pydantic.ValidationError:
+            result = {}
+        missing = RESULT - result.keys()
+        if missing:
+            raise InputError(f"{path}: not a result that this version writes; delete it and run the suite again")
+        return result
 
     def all(self) -> list[dict[str, Any]]:
-        """Read every result, in the order of their keys.
+        """Read the finished results of the suite that was run last, in its order.
 
         Raises:
             InputError: a file is not a result.
         """
-        return [_read(path) for path in self.paths()]
+        return [self.get(key) for key in self.about().get("keys", []) if self.has(key)]
 
     def paths(self) -> list[Path]:
         """List the files of the results, in the order of their keys."""
@@ -64,11 +79,11 @@ class Store:
         return sorted(path for path in (self.folder / "cases").glob("*.json") if not path.name.startswith("."))
 
     def put_about(self, about: dict[str, Any]) -> None:
-        """Write down what made the results."""
+        """Write down which suite is run."""
         write_text(self.folder / "run.json", json.dumps(about, indent=2, sort_keys=True) + "\n")
 
     def about(self) -> dict[str, Any]:
-        """Read what made the results; empty where no run has finished."""
+        """Read which suite was run last; empty where none was."""
         path = self.folder / "run.json"
         return _read(path) if path.is_file() else {}
 
@@ -81,16 +96,22 @@ def create(folder: Path) -> Store:
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: a file, not a folder; choose another place with --results")
-    if (folder / "store.json").is_file():
-        return open_store(folder)
+    if not (folder / "store.json").is_file():
+        try:
+            # Another run that is just making the store shows as a file with a dot.
+            if folder.is_dir() and any(
+                not path.name.startswith(".") and path.name != "store.json" for path in folder.iterdir()
+            ):
+                raise InputError(f"{folder}: not a store of results and not empty; choose another place with --results")
+        except OSError as error:
+            raise InputError(f"{folder}: {error.strerror or error}; choose another place with --results") from None
+        write_text(folder / "store.json", json.dumps({"version": VERSION}) + "\n")
+    store = open_store(folder)
     try:
-        if folder.is_dir() and any(folder.iterdir()):
-            raise InputError(f"{folder}: not a store of results and not empty; choose another place with --results")
-        (folder / "cases").mkdir(parents=True, exist_ok=True)
+        (folder / "cases").mkdir(exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: {error.strerror or error}; choose another place with --results") from None
-    write_text(folder / "store.json", json.dumps({"version": VERSION}) + "\n")
-    return Store(folder)
+    return store
 
 
 def open_store(folder: Path) -> Store:

@@ -101,7 +101,7 @@ class Case(_Model):
         """Say in a few words which data the case is about, without its library and method."""
         parts = [f"{name}={value:g}" for name, value in self.parameters.items()]
         plain = self.__class__.model_construct()
-        for name in ("initial", "sites", "ends", "samples", "span", "noise", "missing", "trajectories"):
+        for name in ("initial", "sites", "ends", "integrator", "samples", "span", "noise", "missing", "trajectories"):
             value = getattr(self, name)
             if value != getattr(plain, name):
                 parts.append(
@@ -268,7 +268,8 @@ def _unsound(shown: str, place: str, error: pydantic.ValidationError, model: typ
         if len(first["loc"]) > 1:
             known = _Contestant.model_fields
         return unknown("key", str(first["loc"][-1]), known, f"{where}: {path}" if len(first["loc"]) > 1 else where)
-    return InputError(f"{where}: {path}: {first['msg'][0].lower()}{first['msg'][1:]}")
+    given = "" if first["type"] == "missing" else f", it is {first['input']!r}"
+    return InputError(f"{where}: {path}: {first['msg'][0].lower()}{first['msg'][1:]}{given}")
 
 
 def _expand(grid: _Grid, contestants: dict[str, _Contestant], where: str) -> Iterator[Case]:
@@ -276,6 +277,12 @@ def _expand(grid: _Grid, contestants: dict[str, _Contestant], where: str) -> Ite
     for label in labels:
         if label not in contestants:
             raise unknown("method", label, contestants, where)
+    for name, value in grid:
+        if value == [] and name != "libraries":
+            raise InputError(f"{where}: {name}: an empty list makes no cases; leave the key out")
+    for name, values in grid.parameters.items():
+        if not values:
+            raise InputError(f"{where}: parameters.{name}: an empty list makes no cases; leave the key out")
     if not grid.libraries and not grid.terms:
         raise InputError(f"{where}: libraries: give at least one")
     libraries = [(name, ()) for name in grid.libraries] + [(name, tuple(terms)) for name, terms in grid.terms.items()]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -200,12 +202,17 @@ def read_cases(path: Path) -> pd.DataFrame:
     if not path.is_file():
         raise InputError(f"{path}: no such table; give a store of results, a folder with cases.csv, or a cases.csv")
     try:
-        table = pd.read_csv(path, comment="#", keep_default_na=True)
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        body = itertools.dropwhile(lambda line: line.startswith("#"), lines)
+        table = pd.read_csv(io.StringIO("".join(body)), dtype=str, keep_default_na=False)
     except (ValueError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a table of cases: {error}") from None
     missing = [name for name in ("identity", "status", "e2") if name not in table]
     if missing:
         raise InputError(f"{path}: not a table of cases: the column {missing[0]!r} is missing")
+    for name in (*SCORES, "noise", "seed"):
+        if name in table:
+            table[name] = pd.to_numeric(table[name], errors="coerce")
     return table
 
 

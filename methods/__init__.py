@@ -39,9 +39,16 @@ def find(name: str, base: Path | None = None) -> type[Method]:
     path, _, wanted = name.rpartition(":") if ".py:" in name else (name, "", "")
     if path.endswith(".py"):
         full = (base or Path()) / path
-        kinds: dict[str, type[Method]] = {kind.name: kind for kind in getattr(load_module(full), "METHODS", ())}
-        if not kinds:
-            raise InputError(f"{full}: it must define METHODS = (YourMethod,)")
+        listed = getattr(load_module(full), "METHODS", ())
+        if not isinstance(listed, (tuple, list)) or not listed or not all(hasattr(kind, "name") for kind in listed):
+            raise InputError(f"{full}: it must define METHODS = (YourMethod,), classes with a name")
+        kinds: dict[str, type[Method]] = {kind.name: kind for kind in listed}
+        for kind in kinds.values():
+            lacking = [part for part in ("abilities", "fit") if not hasattr(kind, part)]
+            if lacking:
+                raise InputError(
+                    f"{full}: method {kind.name!r} has no {lacking[0]!r}; see methods/method.py for the protocol"
+                )
         if not wanted and len(kinds) > 1:
             raise InputError(f"{full}: it has several methods; choose one as {path}:{sorted(kinds)[0]}")
         if wanted and wanted not in kinds:

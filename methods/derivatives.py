@@ -93,7 +93,8 @@ def _spline(t: ndarray, field: ndarray, *, smooth: bool) -> Smoothed:
 
     if len(t) <= DEGREE:
         raise InputError(
-            f"a quintic spline needs at least {DEGREE + 1} samples, there are {len(t)}; use FiniteDifference"
+            f"a quintic spline needs at least {DEGREE + 1} samples, there are {len(t)}; "
+            "give more, or use --set differentiation=FiniteDifference"
         )
     # The fit lives on [0, 1], so that the penalty's size does not depend on the unit of time.
     span = t[-1] - t[0]
@@ -160,6 +161,8 @@ def _pysindy(t: ndarray, field: ndarray, kind: str, options: Mapping[str, Any]) 
 
     import pysindy
 
+    if len(t) < 3:
+        raise InputError(f"differentiation {kind!r} needs at least 3 samples, there are {len(t)}; give more")
     if kind in ("FiniteDifference", "SmoothedFiniteDifference"):
         make = getattr(pysindy, kind)
     elif kind in KINDS:

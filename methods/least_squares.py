@@ -36,7 +36,7 @@ class LeastSquares:
         """Minimise |y - A xi|^2."""
         regression = rows(data, library, order, self.differentiation, self.options)
         coefficients = regression.least_squares()
-        return Fit(self.name, library, order, coefficients, regression.residual(coefficients))
+        return Fit(self.name, library, order, coefficients, regression.residual(coefficients), status=regression.status)
 
 
 METHODS = (LeastSquares,)

@@ -144,7 +144,8 @@ def make(kind: type[Method], given: Mapping[str, Any]) -> Method:
         if name not in known:
             raise unknown("setting", name, known, f"method {kind.name!r}")
         try:
-            adapter: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(hints[name])
+            finite = pydantic.ConfigDict(allow_inf_nan=False)
+            adapter: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(hints[name], config=finite)
             if isinstance(value, str) and value.startswith(("[", "{")):
                 values[name] = adapter.validate_json(value)
             else:
@@ -167,6 +168,7 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
     Raises:
         Skipped: the method declares that it cannot take these data.
         InputError: the library cannot be evaluated on the data.
+        TypeError, ValueError: the method gave something that is no fit.
     """
     check_fit(data, library, order)
     reason = obstacle(method.abilities, data, library)
@@ -177,6 +179,10 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
         importlib.import_module(package)
     wall, cpu = time.perf_counter(), time.process_time()
     fit = method.fit(shown, library, order, seed)
+    if not isinstance(fit, Fit):
+        raise TypeError(f"fit() gave {type(fit).__name__}; it must give a Fit")
+    if not np.all(np.isfinite(fit.coefficients)):
+        raise ValueError("the coefficients are not finite")
     return replace(fit, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
 
 

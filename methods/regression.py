@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
+# A derivative below this share of field over step is made of round-off.
+ROUND_OFF = 1e-12
+
 
 @dataclass(frozen=True, eq=False)
 class Regression:
@@ -25,10 +28,22 @@ class Regression:
     Attributes:
         design: A, the terms' values (rows, terms).
         target: y, the derivative of order 1 or 2 (rows,).
+        left_out: rows whose derivative is known but one of whose terms is not finite.
     """
 
     design: Float[ndarray, "rows terms"]
     target: Float[ndarray, " rows"]
+    left_out: int = 0
+
+    @property
+    def status(self) -> str:
+        """Say "ok", or what a reader of the coefficients must know of the rows."""
+        if self.left_out:
+            return f"{self.left_out} of {self.left_out + len(self.target)} rows left out: a term is not finite there"
+        rank = int(np.linalg.matrix_rank(self.design / self.scales, tol=1e-12 * np.sqrt(self.design.size)))
+        if rank < self.design.shape[1]:
+            return f"these data tell only {rank} of {self.design.shape[1]} terms apart; the coefficients are one choice of many"
+        return "ok"
 
     @property
     def scales(self) -> Float[ndarray, " terms"]:
@@ -73,24 +88,38 @@ def rows(
         InputError: the differentiation fails, or no row is complete.
     """
     designs, targets = [], []
+    left_out = 0
     for samples in data:
-        u = differentiate(samples.t, samples.u, differentiation, options)
-        if order == 1:
-            v, rate = None, u.first
-        elif samples.v is None:
-            v, rate = u.first, u.second
-        else:
-            measured = differentiate(samples.t, samples.v, differentiation, options)
-            v, rate = measured.value, measured.first
+        try:
+            with np.errstate(all="ignore"):
+                u = differentiate(samples.t, samples.u, differentiation, options)
+                if order == 1:
+                    v, rate = None, u.first
+                elif samples.v is None:
+                    v, rate = u.first, u.second
+                else:
+                    measured = differentiate(samples.t, samples.v, differentiation, options)
+                    v, rate = measured.value, measured.first
+        except (InputError, np.linalg.LinAlgError) as error:
+            raise InputError(f"{samples.source}: {error}") from None
         one = assemble(samples, library, u.value, v, rate)
         designs.append(one.design)
         targets.append(one.target)
+        left_out += one.left_out
     design, target = np.concatenate(designs), np.concatenate(targets)
+    if len(target) == 0 and left_out:
+        raise InputError(
+            f"{data[0].source}: in every row a term of the library is not finite; are the values too large for it?"
+        )
     if len(target) == 0:
         raise InputError(
             f"{data[0].source}: no sample has its whole stencil; there are too many missing values or too few sites"
         )
-    return Regression(design, target)
+    size = max(float(np.nanmax(np.abs(samples.u))) for samples in data)
+    step = min(float(np.min(np.diff(samples.t))) for samples in data)
+    if np.max(np.abs(target)) <= ROUND_OFF * size / step**order:
+        raise InputError(f"{data[0].source}: nothing moves: the derivative is round-off; there is no motion to fit")
+    return Regression(design, target, left_out)
 
 
 def assemble(
@@ -101,5 +130,8 @@ def assemble(
     inner = rate[:, observed(samples.sites, library.reach, samples.ends)]
     target = np.stack([inner.real, inner.imag] if samples.is_complex else [inner]).ravel()
     design = np.moveaxis(values, 1, -1).reshape(-1, len(library.terms))
-    whole = np.isfinite(target) & np.all(np.isfinite(design), axis=1)
-    return Regression(design[whole], target[whole])
+    known = np.isfinite(target)
+    whole = known & np.all(np.isfinite(design), axis=1)
+    return Regression(
+        design[whole], target[whole], int(np.sum(known) - np.sum(whole)) if not samples.has_missing else 0
+    )

@@ -52,7 +52,7 @@ def sparse_fit(regression: Regression, optimizer: str, arguments: Mapping[str, A
             fitted = getattr(pysindy.optimizers, optimizer)(**arguments).fit(
                 regression.design / (scale * height), regression.target[:, None] / height
             )
-    except (TypeError, ValueError, AttributeError) as error:
+    except Exception as error:
         raise InputError(f"pysindy's {optimizer} with {dict(arguments)}: {error}") from error
     finally:
         np.random.set_state(state)  # noqa: NPY002
@@ -166,7 +166,7 @@ def _fit(
     seed: int,
 ) -> Fit:
     coefficients = sparse_fit(regression, optimizer, arguments, seed)
-    status = "ok" if np.any(coefficients) else "every term was dropped; lower the threshold"
+    status = regression.status if np.any(coefficients) else "every term was dropped; lower the threshold"
     return Fit(name, library, order, coefficients, regression.residual(coefficients), status=status)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import tempfile
 from collections.abc import Iterator
@@ -35,7 +36,10 @@ def whole(path: Path) -> Iterator[Path]:
         temporary.chmod(0o666 & ~mask)
         temporary.replace(path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}; nothing was changed") from error
+        remedy = "; free some space and try again" if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT) else ""
+        raise InputError(
+            f"{path}: cannot be written: {error.strerror or error}; nothing was changed{remedy}"
+        ) from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)

@@ -390,7 +390,9 @@ def evaluate(
             arrays.append(np.broadcast_to(n, (len(t), count)))
         else:
             arrays.append(fields[slot.name, slot.part][:, start + slot.offset : start + slot.offset + count])
-    values = bundle.function(*arrays)
+    # Where a term is not finite (log of 0, an overflow) its value says so; no warning is needed beside it.
+    with np.errstate(all="ignore"):
+        values = bundle.function(*arrays)
     shape = (len(t), count)
     stacked = np.stack([np.broadcast_to(value, shape) for value in values])
     return stacked.reshape(1 + is_complex, len(terms), *shape).astype(float)

@@ -54,8 +54,14 @@ class Samples:
     ends: Ends = "unknown"
 
     def __post_init__(self) -> None:
-        """Check shapes, times and values."""
+        """Check shapes, times and values, and keep the arrays from being changed."""
         where = self.source
+        for name in ("t", "u", "v", "f"):
+            if getattr(self, name) is not None:
+                # A view: whoever made the array may go on writing to it.
+                kept = np.asarray(getattr(self, name)).view()
+                kept.setflags(write=False)
+                object.__setattr__(self, name, kept)
         if self.t.ndim != 1 or self.u.ndim != 2 or self.u.shape[0] != len(self.t):
             raise InputError(f"{where}: t has shape {self.t.shape} and u {self.u.shape}; they must be (T,) and (T, N)")
         if len(self.t) < 2:
@@ -155,7 +161,7 @@ class SimulatedSamples(Samples):
 
     def observed(self) -> Samples:
         """Give what an experiment would have: no truth, and no word on the noise."""
-        return Samples(self.t, self.u, self.v, self.f, None, self.source, self.ends)
+        return Samples(self.t, self.u, self.v, self.f, None, "simulated samples", self.ends)
 
     def truth(self, candidates: Library) -> Float[ndarray, " terms"] | None:
         """Derive the true coefficients over a library; None where the equation is outside its span."""
@@ -296,6 +302,8 @@ def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Sample
     import pandas as pd
 
     columns = list(table.columns)
+    if any(sign in column for column in columns for sign in (";", "\t")):
+        raise InputError(f"{source}: the columns are separated by something else; separate them by commas")
     if "t" not in columns:
         raise InputError(
             f"{source}: there is no column t; the header must be t,u1..uN[,v1..vN][,f1..fN] or t,re1..reN,im1..imN"

@@ -164,7 +164,7 @@ def runge_kutta(
 
 def _unbounded(t: float) -> InputError:
     return InputError(
-        f"the simulation fails near t = {t:g}: the state grows without bound; check parameters and initial state"
+        f"the simulation fails near t = {t:g}: the state grows without bound; check parameters and initial state, or whether the integrator's step is too large (--integrator dop853)"
     )
 
 
@@ -242,6 +242,9 @@ def observe(
         raise InputError(f"noise: {noise!r} must be a number >= 0 (0.01 for one per cent)")
     if not 0 <= missing < 1:
         raise InputError(f"missing: {missing!r} must be at least 0 and below 1")
+
+    if not noise * float(np.max(np.abs(clean.u))) < 1e300:
+        raise InputError(f"noise: {noise!r} is more than a number can hold; take less")
 
     def disturbed(field: ndarray) -> ndarray:
         sigma = noise_size(field, noise)

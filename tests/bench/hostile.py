@@ -31,7 +31,7 @@ class Hostile:
     def abilities(self) -> Abilities:
         return Abilities()
 
-    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:  # noqa: ARG002
+    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         if self.diary:
             with Path(self.diary).open("a") as diary:
                 diary.write(f"{self.deed} {self.seconds} {os.getpid()}\n")
@@ -45,6 +45,8 @@ class Hostile:
             ctypes.PyDLL(None).sleep(600)  # holds the interpreter's lock
         if self.deed == "die":
             os.kill(os.getpid(), signal.SIGKILL)
+        if self.deed == "write":
+            data[0].t[:] *= 2
         if self.deed == "nan":
             return Fit(self.name, library, order, np.full(len(library.terms), np.nan), 0.0)
         time.sleep(self.seconds)

@@ -214,6 +214,16 @@ BAD_COMMANDS = {
     "fit phi4.csv --system phi4 --library lib1 --method oracle": "needs the truth",
     "fit phi4.csv --terms f[n];u[n] --order 2": "no measured input",
     "fit phi4.csv dnls.parquet --system phi4 --library lib1": "real, the other complex",
+    "fit phi4.csv --system phi4 --library lib1 --method sr3 --set regularizer=L7": "L7",
+    "fit phi4.csv --system phi4 --library lib1 --set threshold=nan": "finite number",
+    "fit phi4.csv --system phi4 --library lib1 --method three.py": "METHODS",
+    "fit phi4.csv --system phi4 --library lib1 --method bare.py": "has no 'abilities'",
+    "fit phi4.csv --system phi4 --library lib1 --method raising.py": "ZeroDivisionError: division by zero",
+    "fit semicolons.csv --system phi4 --library lib1": "separate them by commas",
+    "fit still.csv --terms u[n] --order 2": "nothing moves",
+    "fit huge.csv --terms u[n]**12 --order 2": "not finite",
+    "fit short.csv --terms u[n] --order 2": "short.csv: a quintic spline needs at least 6 samples",
+    "simulate phi4 --noise 1e308 --out x.csv": "noise",
     "fit nowhere.csv --system phi4 --library lib1": "nowhere.csv: no such file",
     "fit . --system phi4 --library lib1": "ending",
     "simulate phi4 --set C=two --out x.csv": "not a number",
@@ -239,6 +249,16 @@ BAD_COMMANDS = {
 
 @pytest.mark.parametrize("command", BAD_COMMANDS)
 def test_bad_input_is_one_clear_line_and_exit_code_2(command: str, folder: Path) -> None:
+    (folder / "three.py").write_text("METHODS = (3,)\n")
+    (folder / "bare.py").write_text("class Bare:\n    name = 'bare'\n\nMETHODS = (Bare,)\n")
+    (folder / "raising.py").write_text(
+        "from methods.method import Abilities\n\nclass Raising:\n    name = 'raising'\n    abilities = Abilities()\n\n"
+        "    def fit(self, data, library, order, seed):\n        return 1 / 0\n\nMETHODS = (Raising,)\n"
+    )
+    (folder / "semicolons.csv").write_text("t;u1;u2\n0;1;2\n1;2;3\n")
+    (folder / "still.csv").write_text("t,u1\n" + "".join(f"{k},3.5\n" for k in range(20)))
+    (folder / "huge.csv").write_text("t,u1\n" + "".join(f"{k},{(-1) ** k * 1e200}\n" for k in range(20)))
+    (folder / "short.csv").write_text("t,u1\n" + "".join(f"{k},{k * k}\n" for k in range(4)))
     (folder / "bad.toml").write_text('[methods.a]\nmethod = "zero"\n[[grid]]\nsistem = "phi4"\nlibraries = ["lib1"]\n')
     before = sorted(path.name for path in folder.iterdir())
     done = latticebench(*command.split(), cwd=folder)

@@ -70,7 +70,7 @@ def test_finished_cases_are_not_run_again_and_failures_only_when_asked(tmp_path:
     store = create(tmp_path / "store")
     first, _ = run(suite, store, jobs=1)
     again, tally = run(suite, store, jobs=1)
-    assert again == first
+    assert again == first == store.all()
     assert (tally.ran, tally.reused) == (0, 2)
     assert len(diary_lines(diary)) == 2
     _, tally = run(suite, store, jobs=1, retry=True)
@@ -179,3 +179,20 @@ def test_two_runs_on_one_store_do_not_corrupt_it(tmp_path: Path) -> None:
         assert runner.returncode == 0, err
         assert b"10 cases (10 ok)" in out
     assert len(create(tmp_path / "store").all()) == 10
+
+
+def test_a_method_that_writes_to_its_samples_harms_no_other(tmp_path: Path) -> None:
+    suite = hostile_suite(tmp_path / "s", {"writing": 'deed = "write"', "good": 'deed = "behave"'})
+    results, _ = run(suite, create(tmp_path / "store"), jobs=1)
+    assert [result["status"] for result in results] == ["failed", "ok"]
+    assert "read-only" in results[0]["reason"]
+
+
+def test_a_table_shows_the_suite_that_was_run_last_and_where_each_result_came_from(tmp_path: Path) -> None:
+    store = create(tmp_path / "store")
+    run(hostile_suite(tmp_path / "s", {"a": "seconds = 0.01"}), store, jobs=1)
+    run(hostile_suite(tmp_path / "s", {"a": "seconds = 0.02"}), store, jobs=1, about={"command": "latticebench run s"})
+    assert [result["case"]["settings"] for result in store.all()] == [{"seconds": 0.02}]
+    assert len(store.paths()) == 2
+    assert store.about()["command"] == "latticebench run s"
+    assert {"commit", "date", "machine", "versions"} == set(store.all()[0]["made"])
