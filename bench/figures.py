@@ -35,10 +35,8 @@ def draw_all(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], fol
         InputError: a file cannot be written.
     """
     written = []
-    for result in results:
-        if result["history"] is not None and result["coefficients"] is not None:
-            title = Case.model_validate(result["case"]).title
-            written.append(_save(learning_curve(result), folder / f"coefficients-{slug(title)}.png", about))
+    for name, group in panels(results).items():
+        written.append(_save(panel(group), folder / f"coefficients-{name}.png", about))
     table = cases(results)
     if table["e2"].notna().any():
         written.append(_save(errors(table), folder / "errors.png", about))
@@ -48,36 +46,81 @@ def draw_all(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], fol
     return written
 
 
+def panels(results: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """Group results by what was fitted: those of one group share their samples and library.
+
+    Only groups in which a method kept its history are given, each under a name for its file.
+    """
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for result in results:
+        case = Case.model_validate(result["case"])
+        if result["coefficients"] is not None:
+            groups.setdefault(slug(f"{case.part} {case.data} {case.library} seed {case.seed}"), []).append(result)
+    return {name: group for name, group in groups.items() if any(result["history"] for result in group)}
+
+
 def slug(text: str) -> str:
     """Turn a title into a file name."""
     return re.sub(r"[^a-z0-9.=]+", "-", text.lower()).strip("-")
 
 
-def learning_curve(result: Mapping[str, Any]) -> Figure:
-    """Draw coefficients against iteration, as the paper's figures: solid found, dashed true, absent terms black."""
-    case = Case.model_validate(result["case"])
-    history, truth = result["history"], result["truth"]
-    terms = list(result["coefficients"])
-    curves = np.array(history["coefficients"])
-    figure, axes = _axes(7.0, 4.2)
-    colours = iter(COLOURS)
-    for k, term in enumerate(terms):
-        absent = truth is not None and truth[term] == 0
-        colour = "black" if absent else next(colours, "tab:gray")
-        axes.plot(history["step"], curves[:, k], color=colour, lw=0.9 if absent else 1.6, label=f"${Term(term).latex}$")
-        if truth is not None and not absent:
-            axes.axhline(truth[term], color=colour, ls="--", lw=1)
-    axes.set_xlabel("iteration")
-    axes.set_ylabel("coefficient")
-    if truth is not None:
-        values = [*truth.values(), 0.0]
-        margin = 0.6 * (max(values) - min(values) or 1)
-        axes.set_ylim(min(values) - margin, max(values) + margin)
-    error = "" if result["e2"] is None else f"   E2 = {float(result['e2']):.1e}"
-    axes.set_title(f"{case.data}, {case.library}, {case.label}{error}", fontsize=9)
-    if len(terms) <= MOST_NAMES:
-        axes.legend(fontsize=7, ncol=1, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw coefficients against iteration, as the paper's figures, and beside them what each method ends with.
+
+    Solid lines are found, dashed ones true; absent terms are black; a term has one colour throughout.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.lines import Line2D
+
+    learnt = [result for result in group if result["history"]]
+    case = Case.model_validate(group[0]["case"])
+    terms, truth = list(group[0]["coefficients"]), group[0]["truth"]
+    colours = _colours(terms, truth)
+    widths = [4.0] * len(learnt) + [0.8 + 0.55 * len(group)]
+    figure, all_axes = plt.subplots(
+        1, len(widths), figsize=(sum(widths) + 1.6, 3.9), sharey=True, squeeze=False, layout="constrained",
+        gridspec_kw={"width_ratios": widths},
+    )  # fmt: skip
+    for axes, result in zip(all_axes[0], learnt, strict=False):
+        history, label = result["history"], result["case"]["label"]
+        curves = np.array(history["coefficients"])
+        for k, term in enumerate(terms):
+            axes.plot(history["step"], curves[:, k], color=colours[term], lw=0.9 if colours[term] == "black" else 1.6)
+        axes.set_xlabel("iteration")
+        axes.set_title(_with_error(label, result), fontsize=8)
+    last = all_axes[0][-1]
+    for place, result in enumerate(group):
+        for term, value in result["coefficients"].items():
+            last.plot(place, value, "o", color=colours[term], ms=3.5 if colours[term] == "black" else 5.5)
+    names = [_with_error(result["case"]["label"], result) for result in group]
+    last.set_xticks(range(len(group)), names, rotation=90, fontsize=7)
+    last.set_xlim(-0.6, len(group) - 0.4)
+    for axes in all_axes[0]:
+        for term in terms:
+            if truth is not None and truth[term] != 0:
+                axes.axhline(truth[term], color=colours[term], ls="--", lw=0.9)
+        axes.grid(axis="y", alpha=0.2)
+    all_axes[0][0].set_ylabel("coefficient")
+    values = [0.0, *(truth.values() if truth is not None else group[0]["coefficients"].values())]
+    margin = 0.4 * (max(values) - min(values) or 1)
+    all_axes[0][0].set_ylim(min(values) - margin, max(values) + margin)
+    marks = [Line2D([], [], color=colours[term], label=f"${Term(term).latex}$") for term in terms[:MOST_NAMES]]
+    figure.legend(handles=marks, fontsize=7, loc="outside right center", frameon=False)
+    figure.suptitle(" ".join(part for part in (case.part, case.data + ",", case.library) if part), fontsize=9)
     return figure
+
+
+def _colours(terms: Sequence[str], truth: Mapping[str, float] | None) -> dict[str, str]:
+    """Give each term that is in the equation a colour of its own, and black to the absent ones."""
+    colours = iter(COLOURS)
+    return {term: "black" if truth is not None and truth[term] == 0 else next(colours, "tab:gray") for term in terms}
+
+
+def _with_error(label: str, result: Mapping[str, Any]) -> str:
+    return label if result["e2"] is None else f"{label}  E2 {float(result['e2']):.0e}"
 
 
 def errors(table: pd.DataFrame) -> Figure:

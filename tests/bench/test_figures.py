@@ -8,7 +8,7 @@ import matplotlib.image
 from PIL import Image
 
 from bench.case import blank
-from bench.figures import draw_all, learning_curve
+from bench.figures import draw_all, panel
 from bench.suite import Case
 
 
@@ -22,14 +22,21 @@ def learned() -> dict[str, object]:
     return made
 
 
-def test_the_learning_curve_shows_found_solid_true_dashed_and_absent_black() -> None:
-    axes = learning_curve(learned()).axes[0]
+def test_a_panel_shows_found_solid_true_dashed_and_absent_black() -> None:
+    axes = panel([learned()]).axes[0]
     solid = [line for line in axes.lines if line.get_linestyle() == "-"]
     dashed = [line for line in axes.lines if line.get_linestyle() == "--"]
     assert [list(line.get_ydata()) for line in solid] == [[0, 1, 1.9], [0, 0.3, 0.1]]
     assert [line.get_color() for line in solid] == ["tab:blue", "black"]
     assert len(dashed) == 1
     assert set(dashed[0].get_ydata()) == {2.0}
+
+
+def test_beside_a_panel_stands_what_each_method_ends_with() -> None:
+    other = {**learned(), "history": None, "coefficients": {"u[n]": 1.5, "u[n]**3": 0.0}}
+    last = panel([learned(), other]).axes[1]
+    marks = [(line.get_xdata()[0], line.get_ydata()[0]) for line in last.lines if line.get_marker() == "o"]
+    assert marks == [(0, 1.9), (0, 0.1), (1, 1.5), (1, 0.0)]
 
 
 def test_every_figure_is_written_with_its_provenance(tmp_path: Path) -> None:

@@ -1,0 +1,148 @@
+"""Fit panel (1b) of the paper with DeepXDE and with this project's PINNs: error and seconds side by side, in one run.
+
+phi^4 with C = 2, library lib2, 31 sites, 50 noise-free samples of u and v. DeepXDE gets what `pinn` has: the 3 x 40 tanh network
+with time scaled to [-1, 1], 201 collocation times, the same loss with the same weights, coefficients in the same units and
+started at 0, Adam and then L-BFGS with the same numbers of steps, double precision, one thread. What differs: Glorot weights
+in the first layer, a constant learning rate, and torch's L-BFGS. Its observations are two point sets, u and v.
+
+    python results/peers/deepxde_fit.py [--limit 900] [--out results/peers]
+
+DeepXDE stops when its steps are done or after `--limit` seconds. It needs `deepxde>=1.15,<1.16` (the extra `peers`) and writes
+fit.csv and fit.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+# Both are read when the packages are imported.
+os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["DDE_BACKEND"] = "pytorch"
+
+import numpy as np
+import pandas as pd
+
+import methods
+import systems
+from bench.provenance import origin
+from bench.tables import render
+from methods.method import make, solve
+from methods.pinn import PINN, scales
+from systems.files import write_text
+from systems.lattice import Library
+from systems.samples import Samples
+from systems.simulate import simulate
+
+SEED, GOOD = 1, 0.01
+
+
+def deepxde(samples: Samples, library: Library, settings: PINN, limit: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Train DeepXDE's network, and give the seconds (K,), coefficients (K, terms) and seconds of a step of Adam."""
+    import deepxde as dde
+    import torch
+
+    torch.set_num_threads(1)
+    torch.manual_seed(SEED)
+    dde.config.set_random_seed(SEED)
+    dde.config.set_default_float("float64")
+    sites, size = samples.sites, scales([samples], library, 2)
+    units = settings.coefficient_scale * size.coefficients()
+    xi = [dde.Variable(0.0) for _ in units]
+    start, half = float(samples.t[0]), float(samples.t[-1] - samples.t[0]) / 2
+    assert samples.v is not None
+
+    def residuals(t: Any, y: Any) -> list[Any]:
+        u, v = y[:, :sites], y[:, sites:]
+        found = [dde.grad.jacobian(y, t, i=n) - v[:, n : n + 1] for n in range(sites)]
+        for n in range(1, sites - 1):
+            here = u[:, n : n + 1]
+            terms = (u[:, n + 1 : n + 2], u[:, n - 1 : n], here, here**3)
+            law = sum(x * unit * term for x, unit, term in zip(xi, units, terms, strict=True))
+            found.append(dde.grad.jacobian(y, t, i=sites + n) - law)
+        return found
+
+    times = samples.t[:, None]
+    seen = [
+        dde.icbc.PointSetBC(times, samples.u, component=list(range(sites))),
+        dde.icbc.PointSetBC(times, samples.v, component=list(range(sites, 2 * sites))),
+    ]
+    domain = dde.geometry.TimeDomain(samples.t[0], samples.t[-1])
+    problem = dde.data.PDE(domain, residuals, seen, num_domain=settings.collocation, train_distribution="uniform")
+    network = dde.nn.FNN([1, *[settings.width] * settings.layers, 2 * sites], "tanh", "Glorot uniform")
+    network.apply_feature_transform(lambda t: (t - start) / half - 1)
+    weights = [1 / (sites * size.velocity**2)] * sites + [1 / ((sites - 2) * size.rate**2)] * (sites - 2)
+    weights += [settings.data_weight / size.field**2, settings.data_weight / size.velocity**2]
+    model = dde.Model(problem, network)
+    begin = time.perf_counter()
+    seconds, found = [0.0], [np.zeros(len(units))]
+
+    class Record(dde.callbacks.Callback):
+        """Note the coefficients after each step, and stop at the limit."""
+
+        def on_batch_end(self) -> None:
+            seconds.append(time.perf_counter() - begin)
+            found.append(np.array([float(x) for x in xi]) * units)
+            if seconds[-1] > limit:
+                self.model.stop_training = True
+
+    common = {"external_trainable_variables": xi, "loss_weights": weights, "verbose": 0}
+    model.compile("adam", lr=settings.learning_rate, **common)
+    model.train(iterations=settings.adam_steps, display_every=10**9, verbose=0, callbacks=[Record()])
+    step = seconds[-1] / max(1, len(seconds) - 1)
+    if seconds[-1] < limit:
+        steps = settings.lbfgs_steps
+        dde.optimizers.set_LBFGS_options(maxcor=settings.memory, maxiter=steps, maxfun=steps, ftol=0.0, gtol=0.0)
+        model.compile("L-BFGS", **common)
+        model.train(display_every=10**9, verbose=0, callbacks=[Record()])
+    return np.array(seconds), np.array(found), step
+
+
+def first_good(seconds: np.ndarray, errors: np.ndarray) -> float:
+    """Give the time from which on the error stays at or below GOOD; NaN if it never does."""
+    bad = np.flatnonzero(errors > GOOD)
+    last = bad[-1] + 1 if len(bad) else 0
+    return float(seconds[last]) if last < len(errors) else float("nan")
+
+
+def main() -> None:
+    """Measure and write the two files."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--limit", type=float, default=900.0, help="seconds after which DeepXDE is stopped")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent, help="folder of the two files")
+    given = parser.parse_args()
+    system = systems.find("phi4")
+    samples, library = simulate(system).observed(), system.library("lib2")
+    truth = system.truth(library, {})
+    assert truth is not None
+
+    def errors(found: np.ndarray) -> np.ndarray:
+        return np.asarray(np.linalg.norm(found - truth, axis=-1) / np.linalg.norm(truth))
+
+    rows = []
+    for name in ("pinn", "pinn-vp"):
+        fit = solve(make(methods.find(name), {}), [samples], library, 2, SEED)
+        assert fit.history is not None
+        reached = first_good(fit.history.seconds, errors(fit.history.coefficients))
+        rows.append({"program": f"latticebench {name}", "steps": int(fit.history.step[-1]), "seconds": fit.seconds,
+                     "E2": float(errors(fit.coefficients)), "seconds to E2 <= 0.01": min(reached, fit.seconds)})  # fmt: skip
+        print(rows[-1], flush=True)
+    seconds, found, step = deepxde(samples, library, PINN(), given.limit)
+    rows.append({"program": "DeepXDE, the network and loss of pinn", "steps": len(seconds) - 1, "seconds": float(seconds[-1]),
+                 "E2": float(errors(found[-1])), "seconds to E2 <= 0.01": first_good(seconds, errors(found))})  # fmt: skip
+    table = pd.DataFrame(rows)
+    about = {
+        "command": f"python results/peers/deepxde_fit.py --limit {given.limit:g}",
+        "DeepXDE's time limit": f"{given.limit:g} s; a step of Adam took it {1e3 * step:.1f} ms; no time stands where it never got there",
+        "seed": SEED, **origin(), "deepxde": __import__("importlib.metadata").metadata.version("deepxde"),
+    }  # fmt: skip
+    for form in ("csv", "md"):
+        write_text(given.out / f"fit.{form}", render(table, about, form))
+    print(table.to_string())
+
+
+if __name__ == "__main__":
+    main()

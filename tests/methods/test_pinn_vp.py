@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import systems
+from methods.method import Skipped, make, solve
+from methods.pinn import scales
+from methods.pinn_vp import PINNVP, Curve, hidden, step
+from systems.errors import InputError
+from systems.lattice import library
+from systems.samples import Samples
+from systems.simulate import observe, sample_times, simulate
+
+SMALL = {"width": 20, "collocation": 61}
+
+
+def chain(sites: int, ends: str = "unknown", *, is_complex: bool = False) -> Samples:
+    t = np.linspace(0.5, 2.5, 15)
+    u = np.sin(t[:, None] + 0.7 * np.arange(sites)) + 0.2
+    v = np.cos(1.3 * t[:, None] - 0.4 * np.arange(sites))
+    if is_complex:
+        return Samples(t, u + 1j * v, ends=ends)  # type: ignore[arg-type]
+    return Samples(t, u, v, ends=ends)  # type: ignore[arg-type]
+
+
+def oscillators(sites: int = 3) -> tuple[Samples, np.ndarray]:
+    """Uncoupled oscillators u'' = -2 u, exact in closed form."""
+    t = np.linspace(0, 4, 40)
+    amplitude, phase, w = 1 + 0.3 * np.arange(sites), 0.9 * np.arange(sites), np.sqrt(2)
+    u = amplitude * np.cos(w * t[:, None] + phase)
+    return Samples(t, u, -w * amplitude * np.sin(w * t[:, None] + phase)), np.array([-2.0, 0.0])
+
+
+def test_the_hidden_layer_is_orthonormal_and_its_derivatives_are_those_of_finite_differences():
+    times = np.linspace(1, 4, 81)
+    inner = np.array([1.7, 2.2, 3.9])
+    e = 1e-4
+    basis, at = hidden(times, np.concatenate([inner - e, inner, inner + e]), 15, 4.0, np.random.default_rng(0))
+    units = basis.value.shape[1]
+    np.testing.assert_allclose(basis.value.T @ basis.value / 81, np.eye(units), atol=1e-5)
+    before, here, after = np.split(at.value, 3)
+    well = np.max(np.abs(here), axis=0) < 1e3
+    np.testing.assert_allclose(at.first[3:6][:, well], ((after - before) / (2 * e))[:, well], rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(
+        at.second[3:6][:, well], ((after - 2 * here + before) / e**2)[:, well], rtol=1e-2, atol=1
+    )
+
+
+CASES = {
+    "interior sites": (chain(5), "u[n+1]; u[n-1]; u[n]**3; v[n]", 2),
+    "free ends": (chain(4, "free"), "u[n+1]+u[n-1]; u[n]**2*v[n+1]", 2),
+    "antiperiodic ends": (chain(4, "antiperiodic"), "u[n+1]; n*u[n]; cos(1.7*t)", 2),
+    "fixed ends": (chain(4, "fixed"), "u[n+1]; u[n-1]; u[n]", 1),
+    "complex": (chain(5, is_complex=True), "u[n+1]; i*u[n-1]; abs(u[n])**2*u[n]", 1),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_right_hand_side_is_minus_half_the_slope_of_the_objective(name):
+    samples, texts, order = CASES[name]
+    candidates = library("lib", texts)
+    draw = np.random.default_rng(1)
+    curve = Curve(
+        samples, candidates, order, scales([samples], candidates, order), PINNVP(width=6, collocation=21), draw
+    )
+    a, xi = curve.weights + 0.1 * draw.normal(size=curve.weights.shape), draw.normal(size=len(candidates.terms))
+    matrix, right = curve.normal(a, xi, 0.7)
+    np.testing.assert_allclose(matrix, matrix.T, rtol=1e-9, atol=1e-9 * np.max(np.abs(matrix)))
+
+    def objective(shift: np.ndarray) -> float:
+        moved = a + shift[: curve.unknowns].reshape(curve.outputs, curve.units).T
+        data, law = curve.misfits(moved, xi + shift[curve.unknowns :])
+        return data + 0.7**2 * law
+
+    for _ in range(5):
+        way = draw.normal(size=len(right)) / np.sqrt(len(right))
+        slope = (objective(1e-5 * way) - objective(-1e-5 * way)) / 2e-5
+        assert -2 * right @ way == pytest.approx(slope, rel=1e-5, abs=1e-6 * np.max(np.abs(right)))
+
+
+def test_a_step_and_the_trace_of_the_hat_matrix_are_those_of_plain_linear_algebra():
+    samples, texts, order = CASES["interior sites"]
+    candidates = library("lib", texts)
+    settings = PINNVP(width=5, collocation=21)
+    curve = Curve(samples, candidates, order, scales([samples], candidates, order), settings, np.random.default_rng(2))
+    xi = np.array([0.5, 0.2, -0.3, 0.1])
+    matrix, right = curve.normal(curve.weights, xi, 0.3)
+    change = np.linalg.solve(matrix, right)
+    found = step([curve], [curve.weights], xi, 0.3, 0.0, hat=True)
+    np.testing.assert_allclose(found.coefficients - xi, change[curve.unknowns :], rtol=1e-5, atol=1e-8)
+    moved = change[: curve.unknowns].reshape(curve.outputs, curve.units).T
+    np.testing.assert_allclose(found.weights[0] - curve.weights, moved, rtol=1e-4, atol=1e-7)
+    inverse = np.linalg.inv(matrix)
+    np.testing.assert_allclose(found.covariance, inverse[curve.unknowns :, curve.unknowns :], rtol=1e-5)
+    of_data, _ = curve.normal(curve.weights, xi, 0.0)
+    # Between the trace without and with the coefficients' share, which is counted whole.
+    exact = float(np.trace(inverse @ of_data))
+    assert exact - 1e-6 <= found.freedom <= exact + len(xi) + 1e-6
+
+
+def test_an_oscillator_is_found_to_many_digits():
+    samples, truth = oscillators()
+    fit = solve(PINNVP(), [samples], library("lib", "u[n]; u[n]**3"), 2, 0)
+    np.testing.assert_allclose(fit.coefficients, truth, atol=1e-5)
+    assert fit.status == "ok"
+    assert fit.history is not None
+    np.testing.assert_array_equal(fit.history.coefficients[-1], fit.coefficients)
+
+
+def test_phi4_without_noise_and_with_one_per_cent_is_found():
+    system = systems.find("phi4")
+    clean = simulate(system, sites=9, times=sample_times(40, 8.0))
+    candidates = system.library("lib2")
+    truth = clean.truth(candidates)
+    assert truth is not None
+    for samples, bound in ((clean, 1e-4), (observe(clean, np.random.default_rng(0), noise=0.01), 3e-2)):
+        fit = solve(PINNVP(width=60), [samples], candidates, 2, 0)
+        assert np.linalg.norm(fit.coefficients - truth) <= bound * np.linalg.norm(truth)
+
+
+def test_standard_errors_have_the_size_of_the_errors():
+    samples, truth = oscillators()
+    assert samples.v is not None
+    shares = []
+    for seed in range(12):
+        draw = np.random.default_rng(seed)
+        noisy = Samples(
+            samples.t,
+            samples.u + 0.02 * draw.normal(size=samples.u.shape),
+            samples.v + 0.02 * draw.normal(size=samples.u.shape),
+        )
+        fit = solve(PINNVP(**SMALL), [noisy], library("lib", "u[n]; u[n]**3"), 2, seed)
+        assert fit.stderr is not None
+        shares.append((fit.coefficients - truth) / fit.stderr)
+    assert 0.4 < np.sqrt(np.mean(np.square(shares))) < 2.5
+
+
+def test_missing_values_and_velocities_that_were_not_observed_are_taken():
+    samples, truth = oscillators()
+    u = samples.u.copy()
+    u[np.random.default_rng(4).uniform(size=u.shape) < 0.2] = np.nan
+    fit = solve(PINNVP(**SMALL), [Samples(samples.t, u)], library("lib", "u[n]; u[n]**3"), 2, 0)
+    np.testing.assert_allclose(fit.coefficients, truth, atol=1e-2)
+
+
+def test_a_measured_input_and_two_trajectories_are_taken():
+    # u'' = -4 u + f with f = cos(t).
+    t = np.linspace(0, 6, 61)
+    data = [
+        Samples(t[:length], (np.cos(t) / 3 + b * np.cos(2 * t))[:length, None], f=np.cos(t)[:length, None])
+        for b, length in ((0.2, 61), (-0.5, 45))
+    ]
+    fit = solve(PINNVP(width=40), data, library("lib", "u[n]; f[n]"), 2, 0)
+    np.testing.assert_allclose(fit.coefficients, [-4, 1], atol=1e-2)
+
+
+def test_the_same_seed_gives_the_same_digits():
+    samples, _ = oscillators()
+    first, again = (solve(PINNVP(**SMALL), [samples], library("lib", "u[n]"), 2, 5) for _ in range(2))
+    np.testing.assert_array_equal(first.coefficients, again.coefficients)
+
+
+def test_too_many_unknowns_are_a_reason_to_skip():
+    with pytest.raises(Skipped, match="width"):
+        solve(PINNVP(), [chain(400)], library("lib", "u[n]"), 2, 0)
+
+
+@pytest.mark.parametrize(("name", "value"), [("width", 0), ("weights", []), ("tolerance", -1.0)])
+def test_unsound_settings_are_named(name, value):
+    with pytest.raises(InputError, match=name):
+        make(PINNVP, {name: value})
