@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -41,8 +42,9 @@ def draw_all(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], fol
     if table["e2"].notna().any():
         written.append(_save(errors(table), folder / "errors.png", about))
         written.append(_save(error_against_seconds(table), folder / "error-against-seconds.png", about))
-        if table["noise"].nunique() > 1:
+        if not _by_noise(table[table["e2"].notna()]).empty:
             written.append(_save(error_against_noise(table), folder / "error-against-noise.png", about))
+            written.append(_save(cost(table), folder / "cost.png", about))
     return written
 
 
@@ -81,7 +83,7 @@ def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
     colours = _colours(terms, truth)
     widths = [4.0] * len(learnt) + [0.8 + 0.55 * len(group)]
     figure, all_axes = plt.subplots(
-        1, len(widths), figsize=(sum(widths) + 1.6, 3.9), sharey=True, squeeze=False, layout="constrained",
+        1, len(widths), figsize=(sum(widths) + 1.6, 4.3), sharey=True, squeeze=False, layout="constrained",
         gridspec_kw={"width_ratios": widths},
     )  # fmt: skip
     for axes, result in zip(all_axes[0], learnt, strict=False):
@@ -93,10 +95,12 @@ def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
         axes.set_title(_with_error(label, result), fontsize=8)
     last = all_axes[0][-1]
     for place, result in enumerate(group):
-        for term, value in result["coefficients"].items():
-            last.plot(place, value, "o", color=colours[term], ms=3.5 if colours[term] == "black" else 5.5)
+        for k, (term, value) in enumerate(result["coefficients"].items()):
+            # Side by side, since terms with the same coefficient would hide each other.
+            beside = place + 0.6 * ((k + 0.5) / len(terms) - 0.5)
+            last.plot(beside, value, "o", color=colours[term], ms=3 if colours[term] == "black" else 4)
     names = [_with_error(result["case"]["label"], result) for result in group]
-    last.set_xticks(range(len(group)), names, rotation=90, fontsize=7)
+    last.set_xticks(range(len(group)), names, rotation=60, ha="right", rotation_mode="anchor", fontsize=7)
     last.set_xlim(-0.6, len(group) - 0.4)
     for axes in all_axes[0]:
         for term in terms:
@@ -170,15 +174,54 @@ def error_against_seconds(table: pd.DataFrame) -> Figure:
     return figure
 
 
+def cost(table: pd.DataFrame) -> Figure:
+    """Draw E2 against the seconds of the fit, one panel for each noise level (down) of each system and library (across).
+
+    Only systems and libraries that were run at several noise levels are drawn; one mark a case.
+    """
+    import matplotlib.pyplot as plt
+
+    good = _by_noise(table[(table["status"] == "ok") & table["e2"].notna()])
+    across = list(dict.fromkeys(zip(good["system"], good["library"], strict=True)))
+    down = sorted(good["noise"].unique())
+    methods = list(dict.fromkeys(good["method"]))
+    figure, grid = plt.subplots(
+        len(down), len(across), figsize=(3.3 * len(across) + 1.8, 2.7 * len(down)), squeeze=False, layout="constrained",
+        sharex=True, sharey=True,
+    )  # fmt: skip
+    for (row, noise), (column, (system, library)) in itertools.product(enumerate(down), enumerate(across)):
+        axes = grid[row][column]
+        for k, method in enumerate(methods):
+            here = (good["system"] == system) & (good["library"] == library) & (good["noise"] == noise)
+            chosen = good[here & (good["method"] == method)]
+            axes.plot(
+                np.maximum(chosen["seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)], color=f"C{k % 10}",
+                ms=5, alpha=0.75, label=method,
+            )  # fmt: skip
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.grid(alpha=0.25)
+        axes.set_title(f"{system}, {library}, {100 * noise:g} % noise", fontsize=8)
+    figure.supxlabel("seconds of the fit (one core)", fontsize=9)
+    figure.supylabel("relative error of the coefficients, E2", fontsize=9)
+    figure.legend(*grid[0][0].get_legend_handles_labels(), fontsize=8, loc="outside right center", frameon=False)
+    return figure
+
+
+def _by_noise(table: pd.DataFrame) -> pd.DataFrame:
+    """Take the systems and libraries that have several noise levels, with `system` as the data without its noise."""
+    named = table.assign(system=table["data"].str.replace(r" noise=\S+", "", regex=True))
+    levels = named.groupby(["system", "library"])["noise"].transform("nunique")
+    return named[levels > 1]
+
+
 def error_against_noise(table: pd.DataFrame) -> Figure:
     """Draw the median E2 against the noise level, one line a method, one panel for system and library."""
     import matplotlib.pyplot as plt
 
-    known = table[table["e2"].notna() | ~table["status"].isin(["ok", "skipped"])].copy()
-    known["system"] = known["data"].str.replace(r" noise=\S+", "", regex=True)
+    known = _by_noise(table[table["e2"].notna() | ~table["status"].isin(["ok", "skipped"])]).copy()
     known.loc[known["e2"].isna(), "e2"] = np.inf
-    levels = known.groupby(["system", "library"])["noise"].nunique()
-    panels = [pair for pair in dict.fromkeys(zip(known["system"], known["library"], strict=True)) if levels[pair] > 1]
+    panels = list(dict.fromkeys(zip(known["system"], known["library"], strict=True)))
     across = min(len(panels), 3)
     down = -(-len(panels) // across)
     figure, grid = plt.subplots(down, across, figsize=(4.2 * across, 3.4 * down), squeeze=False, layout="constrained")

@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,7 @@ def deepxde(samples: Samples, library: Library, settings: PINN, limit: float) ->
 
         def on_batch_end(self) -> None:
             seconds.append(time.perf_counter() - begin)
-            found.append(np.array([float(x) for x in xi]) * units)
+            found.append(np.array([x.item() for x in xi]) * units)
             if seconds[-1] > limit:
                 self.model.stop_training = True
 
@@ -122,6 +123,7 @@ def main() -> None:
     def errors(found: np.ndarray) -> np.ndarray:
         return np.asarray(np.linalg.norm(found - truth, axis=-1) / np.linalg.norm(truth))
 
+    made = origin()
     rows = []
     for name in ("pinn", "pinn-vp"):
         fit = solve(make(methods.find(name), {}), [samples], library, 2, SEED)
@@ -133,11 +135,12 @@ def main() -> None:
     seconds, found, step = deepxde(samples, library, PINN(), given.limit)
     rows.append({"program": "DeepXDE, the network and loss of pinn", "steps": len(seconds) - 1, "seconds": float(seconds[-1]),
                  "E2": float(errors(found[-1])), "seconds to E2 <= 0.01": first_good(seconds, errors(found))})  # fmt: skip
+    print(rows[-1], flush=True)
     table = pd.DataFrame(rows)
     about = {
         "command": f"python results/peers/deepxde_fit.py --limit {given.limit:g}",
         "DeepXDE's time limit": f"{given.limit:g} s; a step of Adam took it {1e3 * step:.1f} ms; no time stands where it never got there",
-        "seed": SEED, **origin(), "deepxde": __import__("importlib.metadata").metadata.version("deepxde"),
+        "seed": SEED, **made, "deepxde": version("deepxde"),
     }  # fmt: skip
     for form in ("csv", "md"):
         write_text(given.out / f"fit.{form}", render(table, about, form))

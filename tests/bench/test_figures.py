@@ -35,7 +35,9 @@ def test_a_panel_shows_found_solid_true_dashed_and_absent_black() -> None:
 def test_beside_a_panel_stands_what_each_method_ends_with() -> None:
     other = {**learned(), "history": None, "coefficients": {"u[n]": 1.5, "u[n]**3": 0.0}}
     last = panel([learned(), other]).axes[1]
-    marks = [(line.get_xdata()[0], line.get_ydata()[0]) for line in last.lines if line.get_marker() == "o"]
+    marks = [
+        (round(float(line.get_xdata()[0])), line.get_ydata()[0]) for line in last.lines if line.get_marker() == "o"
+    ]
     assert marks == [(0, 1.9), (0, 0.1), (1, 1.5), (1, 0.0)]
 
 
@@ -43,7 +45,12 @@ def test_every_figure_is_written_with_its_provenance(tmp_path: Path) -> None:
     other = learned()
     other["case"] = Case(system="phi4", library="lib1", label="net", method="net", noise=0.1).model_dump(mode="json")
     paths = draw_all([learned(), other], {"command": "latticebench run x", "seeds": [1]}, tmp_path)
-    assert {path.name for path in paths} >= {"errors.png", "error-against-seconds.png", "error-against-noise.png"}
+    assert {path.name for path in paths} >= {
+        "errors.png",
+        "error-against-seconds.png",
+        "error-against-noise.png",
+        "cost.png",
+    }
     assert sum(path.name.startswith("coefficients-") for path in paths) == 2
     for path in paths:
         assert matplotlib.image.imread(path).std() > 0.01
