@@ -197,7 +197,11 @@ def bound(
     Args:
         system: what moves.
         library: whose coefficients are wanted; the equation must be in its span.
-        parameters, sites, times, ends, initial: as in `systems.simulate.simulate`.
+        parameters: values that differ from the system's defaults.
+        sites: N, the system's own number when None.
+        times: sample times, the paper's 50 when None.
+        ends: the system's own when None.
+        initial: which initial state, the first when None.
         known_ends: whether the method is told how the chain ends.
         variations: one trajectory each; a generator varies its initial state.
         velocities: whether v is seen too (order 2).
@@ -233,7 +237,9 @@ def bound_along(
 
     Args:
         data: states at the sample times; for simulated samples their `exact` ones are taken.
-        library, order, coefficients: the equation.
+        library: the terms.
+        order: of the time derivative.
+        coefficients: of the equation that the data follow.
         ends: as the samples say when None.
         velocities: whether v is seen too.
         noise: sigma over the RMS of each field about its mean.
@@ -288,7 +294,7 @@ def bound_along(
 
 
 def _drive(exact: Samples, dynamics: Dynamics) -> tuple[Drive | None, ndarray | None]:
-    """The splines of the sites without an equation: one coefficient a sample, through the exact motion."""
+    """Put splines of one coefficient a sample through the exact motion of the sites without an equation."""
     from scipy.interpolate import make_interp_spline
 
     if len(dynamics.border) == 0:

@@ -60,7 +60,9 @@ def differentiate(
         InputError: there is no such way, its options are wrong, or there are too few samples.
     """
     if np.iscomplexobj(field):
-        real, imaginary = (differentiate(t, part, kind, options) for part in (field.real, field.imag))
+        # A value of which one part is missing is missing.
+        whole = np.where(np.isnan(field), complex(np.nan, np.nan), field)
+        real, imaginary = (differentiate(t, part, kind, options) for part in (whole.real, whole.imag))
         return Smoothed(
             real.value + 1j * imaginary.value,
             real.first + 1j * imaginary.first,

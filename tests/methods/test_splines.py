@@ -1,0 +1,113 @@
+"""Splines with the equation as a penalty: near the bound, exact without noise, and for every kind of samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import systems
+from bench.limit import bound
+from methods.method import solve
+from methods.splines import Splines, _curves, _equation
+from methods.trajectory import prepare
+from systems.simulate import observe, sample_times, simulate
+
+FOUR = [("phi4", "lib2"), ("sine-gordon", "lib2"), ("dnls", "four"), ("ginzburg-landau", "four")]
+EXACT = [
+    ("phi4", "lib3", {}),
+    ("dnls", "four", {"C": 0.5}),
+    ("ginzburg-landau", "four", {"C": 0.5}),
+    ("sine-gordon", "sines", {}),
+]
+
+
+def seen(name, noise, seed, *, velocities=True, missing=0.0, ends=None, **options):
+    system = systems.find(name)
+    clean = simulate(system, **options)
+    found = observe(clean, np.random.default_rng(seed), noise=noise, missing=missing).observed()
+    return replace(found, v=found.v if velocities else None, ends=ends or system.ends)
+
+
+def error(fit, truth):
+    return np.linalg.norm(fit.coefficients - truth) / np.linalg.norm(truth)
+
+
+@pytest.mark.parametrize(("name", "candidates"), [("phi4", "lib4"), ("dnls", "ten")])
+@pytest.mark.parametrize("ends", ["free", "unknown", "antiperiodic"])
+def test_the_equations_derivatives_are_those_of_differences(name, candidates, ends):
+    system = systems.find(name)
+    one = system.library(candidates)
+    samples = seen(name, 0.0, 0, sites=7, times=sample_times(9, 2.0), ends=ends)
+    curves = _curves(prepare(samples, one.terms, system.order), 5, 1.0)
+    draw = np.random.default_rng(0)
+    splines = draw.normal(size=curves.drive.count * curves.each)
+    coefficients = draw.normal(size=len(one.terms))
+    found = _equation(curves, splines, coefficients)
+    along = draw.normal(size=splines.size)
+    across = draw.normal(size=coefficients.size)
+    step = 1e-5
+    plus = _equation(curves, splines + step * along, coefficients + step * across, derivatives=False).residual
+    minus = _equation(curves, splines - step * along, coefficients - step * across, derivatives=False).residual
+    expected = (plus - minus) / (2 * step)
+    got = found.by_spline @ along + found.by_coefficient @ across
+    np.testing.assert_allclose(got, expected, atol=1e-6 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize(("name", "candidates", "parameters"), EXACT)
+def test_without_noise_the_coefficients_are_found(name, candidates, parameters):
+    system = systems.find(name)
+    one = system.library(candidates)
+    fit = solve(Splines(), [seen(name, 0.0, 0, parameters=parameters)], one, system.order, 0)
+    assert error(fit, system.truth(one, parameters)) < 1e-6
+
+
+@pytest.mark.parametrize(("name", "candidates"), [FOUR[0], FOUR[3]])
+def test_with_noise_the_error_is_near_the_bound(name, candidates):
+    noise = 0.05
+    system = systems.find(name)
+    one = system.library(candidates)
+    truth = system.truth(one, {})
+    fits = [solve(Splines(), [seen(name, noise, seed)], one, system.order, 0) for seed in range(2)]
+    limit = bound(system, one, noise=noise)
+    assert np.sqrt(np.mean([error(fit, truth) ** 2 for fit in fits])) < 2 * limit.relative
+    assert np.median([fit.stderr / limit.stderr for fit in fits]) == pytest.approx(1, abs=0.25)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"velocities": False},
+        {"missing": 0.1},
+        {"times": sample_times(50, 10.0, np.random.default_rng(3))},
+        {"ends": "unknown"},
+    ],
+)
+def test_takes_gaps_uneven_times_positions_alone_and_unknown_ends(options):
+    system = systems.find("phi4")
+    one = system.library("lib2")
+    fit = solve(Splines(), [seen("phi4", 0.01, 1, **options)], one, 2, 0)
+    assert error(fit, system.truth(one, {})) < 0.015
+
+
+def test_several_trajectories():
+    system = systems.find("phi4")
+    one = system.library("lib2")
+    data = [seen("phi4", 0.01, 0), seen("phi4", 0.01, 1, variation=np.random.default_rng(5))]
+    fit = solve(Splines(), data, one, 2, 0)
+    assert error(fit, system.truth(one, {})) < 2e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.001, 0.01, 0.05])
+@pytest.mark.parametrize(("name", "candidates"), FOUR)
+def test_the_efficiency_is_at_least_seven_tenths(name, candidates, noise):
+    system = systems.find(name)
+    one = system.library(candidates)
+    truth = system.truth(one, {})
+    fits = [solve(Splines(), [seen(name, noise, seed)], one, system.order, 0) for seed in range(50)]
+    spread = np.sqrt(np.mean([error(fit, truth) ** 2 for fit in fits]))
+    assert bound(system, one, noise=noise).relative / spread > 0.7
+    scores = np.array([(fit.coefficients - truth) / fit.stderr for fit in fits])
+    assert np.mean(np.abs(scores) < 1.96) >= 0.9

@@ -1,0 +1,199 @@
+"""The maximum-likelihood fit reaches the bound, knows its own error, and takes every kind of samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import systems
+from bench.limit import bound
+from methods.method import solve
+from methods.trajectory import Trajectory
+from systems.lattice import library
+from systems.samples import Samples
+from systems.sensitivity import Drive, Dynamics, Stretches
+from systems.simulate import observe, sample_times, simulate
+
+FOUR = [("phi4", "lib2"), ("sine-gordon", "lib2"), ("dnls", "four"), ("ginzburg-landau", "four")]
+EXACT = [
+    ("phi4", "lib1", {}),
+    ("phi4", "lib2", {}),
+    ("phi4", "lib3", {}),
+    ("dnls", "four", {"C": 0.5}),
+    ("ginzburg-landau", "four", {"C": 0.5}),
+    ("sine-gordon", "sines", {}),
+]
+
+
+def seen(name, noise, seed, *, velocities=True, missing=0.0, ends=None, **options):
+    system = systems.find(name)
+    clean = simulate(system, **options)
+    found = observe(clean, np.random.default_rng(seed), noise=noise, missing=missing).observed()
+    return replace(found, v=found.v if velocities else None, ends=ends or system.ends)
+
+
+def error(fit, truth):
+    return np.linalg.norm(fit.coefficients - truth) / np.linalg.norm(truth)
+
+
+@pytest.mark.parametrize(("name", "candidates"), FOUR)
+def test_sensitivities_agree_with_differences_of_another_integrator(name, candidates):
+    system = systems.find(name)
+    one = system.library(candidates)
+    motion = simulate(system, sites=9)
+    truth = system.truth(one, {})
+    dynamics = Dynamics(one.terms, system.order, system.is_complex, 9, system.ends)
+    start = dynamics.pack(motion.exact.u, motion.exact.v)[3]
+    stretches = Stretches(dynamics, np.array([0.0]), np.array([0.4]))
+    found = stretches.vary(truth, start[None], np.array([8]))
+
+    def end(coefficients, state):
+        def rate(t, y):
+            return dynamics.linear(coefficients, np.array([t]), y[None], derivatives=False)[0][0]
+
+        return solve_ivp(rate, (0, 0.4), state, method="Radau", rtol=1e-11, atol=1e-12).y[:, -1]
+
+    step = 1e-4
+    for k in range(len(truth)):
+        shift = step * np.eye(len(truth))[k]
+        expected = (end(truth + shift, start) - end(truth - shift, start)) / (2 * step)
+        np.testing.assert_allclose(found.by_coefficient[0, k], expected, atol=2e-6)
+    for k in (0, dynamics.size // 2, dynamics.size - 1):
+        shift = step * np.eye(dynamics.size)[k]
+        expected = (end(truth, start + shift) - end(truth, start - shift)) / (2 * step)
+        np.testing.assert_allclose(found.by_state[0, k], expected, atol=2e-6)
+
+
+def test_long_chains_are_disturbed_in_groups_with_the_same_result():
+    system = systems.find("phi4")
+    one = system.library("lib2")
+    motion = simulate(system, sites=40)
+    truth = system.truth(one, {})
+    dynamics = Dynamics(one.terms, 2, False, 40, "free")
+    nodes = dynamics.pack(motion.exact.u, motion.exact.v)[:1]
+    stretches = Stretches(dynamics, np.array([0.0]), np.array([0.05]))
+    grouped = stretches.vary(truth, nodes, np.array([1]))
+    assert isinstance(grouped.by_state, list)
+    whole = stretches._vary(truth, nodes, np.array([1]), None, 40, 40)
+    np.testing.assert_allclose(grouped.by_state[0].toarray(), whole.by_state[0], atol=1e-9)
+
+
+def test_spline_basis_is_scipys():
+    from scipy.interpolate import BSpline
+
+    knots = np.concatenate([np.zeros(6), [0.2, 0.5, 0.7], np.ones(6)])
+    drive = Drive(knots, 5)
+    t = np.linspace(0, 1, 17)
+    first, value, slope = drive.basis(t)
+    every = BSpline(knots, np.eye(drive.count), 5)
+    for k in range(len(t)):
+        np.testing.assert_allclose(value[k], every(t)[k, first[k] : first[k] + 6], atol=1e-12)
+        np.testing.assert_allclose(slope[k], every(t, 1)[k, first[k] : first[k] + 6], atol=1e-10)
+
+
+@pytest.mark.parametrize(("name", "candidates", "parameters"), EXACT)
+def test_without_noise_the_coefficients_are_found(name, candidates, parameters):
+    system = systems.find(name)
+    one = system.library(candidates)
+    fit = solve(Trajectory(), [seen(name, 0.0, 0, parameters=parameters)], one, system.order, 0)
+    assert fit.status == "ok"
+    assert error(fit, system.truth(one, parameters)) < 1e-6
+
+
+@pytest.mark.parametrize(("name", "candidates"), FOUR)
+def test_with_noise_the_error_is_that_of_the_bound(name, candidates):
+    noise = 0.05
+    system = systems.find(name)
+    one = system.library(candidates)
+    truth = system.truth(one, {})
+    fits = [solve(Trajectory(), [seen(name, noise, seed)], one, system.order, 0) for seed in range(2)]
+    scores = np.array([(fit.coefficients - truth) / fit.stderr for fit in fits])
+    # 8 to 16 correlated standard scores: their mean square is 1, and far from 4.
+    assert np.sqrt(np.mean(scores**2)) < 2
+    limit = bound(system, one, noise=noise)
+    assert np.median([fit.stderr / limit.stderr for fit in fits]) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"velocities": False},
+        {"missing": 0.1},
+        {"times": sample_times(50, 10.0, np.random.default_rng(3))},
+        {"ends": "unknown"},
+        {"ends": "unknown", "missing": 0.1, "velocities": False},
+    ],
+)
+def test_takes_gaps_uneven_times_positions_alone_and_unknown_ends(options):
+    system = systems.find("phi4")
+    one = system.library("lib2")
+    truth = system.truth(one, {})
+    fit = solve(Trajectory(), [seen("phi4", 0.01, 1, **options)], one, 2, 0)
+    assert fit.status == "ok"
+    assert np.max(np.abs(fit.coefficients - truth) / fit.stderr) < 4
+    assert error(fit, truth) < 0.03
+
+
+def test_missing_complex_values():
+    system = systems.find("dnls")
+    one = system.library("four")
+    fit = solve(Trajectory(), [seen("dnls", 0.01, 0, missing=0.1)], one, 1, 0)
+    assert error(fit, system.truth(one, {})) < 0.003
+
+
+def test_several_trajectories_of_different_lengths_know_more_than_one():
+    system = systems.find("phi4")
+    one = system.library("lib2")
+    draw = np.random.default_rng(0)
+    first, second = (
+        replace(one, u=one.u + 0.01 * draw.normal(size=one.u.shape), v=one.v + 0.002 * draw.normal(size=one.u.shape))
+        for one in (
+            seen("phi4", 0.0, 0),
+            seen("phi4", 0.0, 0, variation=np.random.default_rng(5), times=sample_times(30, 6.0)),
+        )
+    )
+    alone = solve(Trajectory(), [first], one, 2, 0)
+    both = solve(Trajectory(), [first, second], one, 2, 0)
+    assert np.all(both.stderr < alone.stderr)
+    assert np.max(np.abs(both.coefficients - system.truth(one, {})) / both.stderr) < 4
+
+
+def test_a_measured_input_drives_an_oscillator():
+    t = np.linspace(0, 20, 201)
+
+    def force(at):
+        return np.sin(1.3 * at) + 0.5 * np.cos(0.4 * at)
+
+    moved = solve_ivp(
+        lambda at, y: [y[1], -2.0 * y[0] - 0.3 * y[1] + 0.7 * force(at)], (0, 20), [1.0, 0.0],
+        t_eval=t, rtol=1e-10, atol=1e-12,
+    ).y  # fmt: skip
+    noisy = moved[0] + 0.01 * np.random.default_rng(0).normal(size=len(t))
+    samples = Samples(t, noisy[:, None], f=force(t)[:, None], ends="free")
+    fit = solve(Trajectory(), [samples], library("oscillator", "u[n]; v[n]; f[n]"), 2, 0)
+    np.testing.assert_allclose(fit.coefficients, [-2.0, -0.3, 0.7], atol=0.02)
+    assert fit.found["noise_u"] == pytest.approx(0.01, rel=0.2)
+
+
+def test_selection_drops_what_is_not_there():
+    system = systems.find("phi4")
+    one = system.library("lib3")
+    fit = solve(Trajectory(select=True), [seen("phi4", 0.01, 0)], one, 2, 0)
+    np.testing.assert_array_equal(fit.coefficients != 0, system.truth(one, {}) != 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "candidates"), FOUR)
+def test_intervals_cover_and_the_bound_is_reached_over_200_seeds(name, candidates):
+    system = systems.find(name)
+    one = system.library(candidates)
+    truth = system.truth(one, {})
+    for noise in (0.01, 0.05):
+        fits = [solve(Trajectory(), [seen(name, noise, seed)], one, system.order, 0) for seed in range(200)]
+        scores = np.array([(fit.coefficients - truth) / fit.stderr for fit in fits])
+        assert 0.9 <= np.mean(np.abs(scores) < 1.96) <= 0.99
+        spread = np.sqrt(np.mean([error(fit, truth) ** 2 for fit in fits]))
+        assert bound(system, one, noise=noise).relative / spread > 0.85
