@@ -309,7 +309,8 @@ class Splines:
             if reached is None:
                 break
             splines, coefficients, misfit, steps, covariance = reached
-            used = np.minimum(_freedom(curves, steps, sigma, probes), 0.99 * counts)
+            # An estimate from few probes may leave the range that the trace has.
+            used = np.clip(_freedom(curves, steps, sigma, probes), 0.0, 0.99 * counts)
             share = used / counts
             terms = np.log(np.maximum(misfit, floor**2) / (1 - share) ** 2) + np.log(ROBUST + (1 - ROBUST) * share)
             score = float(np.sum(counts * terms) / np.sum(counts))
