@@ -7,7 +7,8 @@ in the first layer, a constant learning rate, and torch's L-BFGS. Its observatio
 
     python results/peers/deepxde_fit.py [--limit 900] [--out results/peers]
 
-DeepXDE stops when its steps are done or after `--limit` seconds. It needs `deepxde>=1.15,<1.16` (the extra `peers`) and writes
+DeepXDE stops when its steps are done or after `--limit` seconds; it hands a thousand iterations of L-BFGS to torch at once and counts
+them as one step, so that it may end somewhat later. It needs `deepxde>=1.15,<1.16` (the extra `peers`) and writes
 fit.csv and fit.md.
 """
 
