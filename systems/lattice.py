@@ -562,7 +562,12 @@ def load_module(path: Path) -> Any:
     # Dataclasses look their module up by its name.
     sys.modules[spec.name] = module
     try:
-        spec.loader.exec_module(module)
+        # A user's folder is not ours to write into.
+        before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+        try:
+            spec.loader.exec_module(module)
+        finally:
+            sys.dont_write_bytecode = before
     except (Exception, SystemExit) as error:
         del sys.modules[spec.name]
         if isinstance(error, InputError):

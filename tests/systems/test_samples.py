@@ -192,7 +192,7 @@ BAD_TABLES = {
     "a long row": ("t,u1\n0,1\n1,2,3\n", ["line 3"]),
     "a short row": ("t,u1,u2\n0,1,2\n1,2\n2,3,4\n", ["row 2", "2 value(s)"]),
     "cut off in the last row": ("t,u1,u2\n0,1,2\n1,2,3\n2,", ["row 3", "2 value(s)"]),
-    "semicolons": ("t;u1\n0;1\n1;2\n", ["no column t"]),
+    "semicolons": ("t;u1\n0;1\n1;2\n", ["separate them by commas"]),
     "an open quote": ('t,u1\n"0,1\n1,2\n', ["not a table"]),
     "blank lines only": ("\n\n", ["empty"]),
     "a remark only": ("# t,u1\n", ["empty"]),
