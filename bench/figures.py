@@ -156,18 +156,18 @@ def errors(table: pd.DataFrame) -> Figure:
 
 
 def error_against_seconds(table: pd.DataFrame) -> Figure:
-    """Draw E2 against the wall time of the fit, one mark a case, one colour a method."""
+    """Draw E2 against the processor time of the fit (one thread), one mark a case, one colour a method."""
     good = table[(table["status"] == "ok") & table["e2"].notna()]
     figure, axes = _axes(6.5, 4.2)
     for k, method in enumerate(dict.fromkeys(good["method"])):
         chosen = good[good["method"] == method]
         axes.plot(
-            np.maximum(chosen["seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)], color=f"C{k % 10}",
+            np.maximum(chosen["cpu_seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)], color=f"C{k % 10}",
             label=method, ms=6, alpha=0.75,
         )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_xlabel("seconds of the fit (one core)")
+    axes.set_xlabel("processor seconds of the fit")
     axes.set_ylabel("relative error of the coefficients, E2")
     axes.grid(alpha=0.25)
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
@@ -175,7 +175,7 @@ def error_against_seconds(table: pd.DataFrame) -> Figure:
 
 
 def cost(table: pd.DataFrame) -> Figure:
-    """Draw E2 against the seconds of the fit, one panel for each noise level (down) of each system and library (across).
+    """Draw E2 against the processor seconds of the fit, one panel for each noise level (down) of each system and library (across).
 
     Only systems and libraries that were run at several noise levels are drawn; one mark a case.
     """
@@ -195,14 +195,14 @@ def cost(table: pd.DataFrame) -> Figure:
             here = (good["system"] == system) & (good["library"] == library) & (good["noise"] == noise)
             chosen = good[here & (good["method"] == method)]
             axes.plot(
-                np.maximum(chosen["seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)], color=f"C{k % 10}",
+                np.maximum(chosen["cpu_seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)], color=f"C{k % 10}",
                 ms=5, alpha=0.75, label=method,
             )  # fmt: skip
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.grid(alpha=0.25)
         axes.set_title(f"{system}, {library}, {100 * noise:g} % noise", fontsize=8)
-    figure.supxlabel("seconds of the fit (one core)", fontsize=9)
+    figure.supxlabel("processor seconds of the fit", fontsize=9)
     figure.supylabel("relative error of the coefficients, E2", fontsize=9)
     figure.legend(*grid[0][0].get_legend_handles_labels(), fontsize=8, loc="outside right center", frameon=False)
     return figure
