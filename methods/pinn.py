@@ -12,7 +12,8 @@ are the sizes of the field, the velocity and the rate in the samples. The equati
 observed (the paper's interior sites), or at every site where the chain's ends are known.
 
 The gradient is written out by hand: tangents and values go through the layers as rows of one matrix, and one backward sweep
-gives the derivative by all weights. The same code runs on NumPy arrays and, on another device, on torch tensors.
+gives the derivative by all weights. The same code runs on NumPy arrays and, on another device, on torch tensors; and for one
+network or, on torch tensors with one more axis in front, for several members that differ in their first weights.
 
 What the paper has: the architecture, the outputs, both residuals, the mirrored data, Adam and L-BFGS as examples of
 optimisers (its sections 2.2, 3 and 4.2). It says nothing on loss weights, learning rates, numbers of steps, numbers of
@@ -28,7 +29,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -164,7 +165,7 @@ class Equation:
     given: dict[Slot, Array]
 
     def windows(self, fields: Array) -> list[Array]:
-        """Cut the fields (P, blocks * N) into one array (P, inner) a slot."""
+        """Cut the fields (..., P, blocks * N) into one array (..., P, inner) a slot."""
         width = self.inner.stop - self.inner.start
         blocks: dict[int, Array] = {}
         arrays = []
@@ -174,10 +175,10 @@ class Equation:
                 continue
             block = self.block(slot)
             if block not in blocks:
-                columns = fields[:, block * self.sites : (block + 1) * self.sites]
+                columns = fields[..., block * self.sites : (block + 1) * self.sites]
                 blocks[block] = columns if self.fold is None else columns @ self.fold
             first = self.reach[0] + slot.offset
-            arrays.append(blocks[block][:, first : first + width])
+            arrays.append(blocks[block][..., first : first + width])
         return arrays
 
     def block(self, slot: Slot) -> int:
@@ -194,22 +195,22 @@ class Equation:
 
         Args:
             slopes: the arrays that belong to `terms.places`.
-            weights: one array (P, inner) a part.
-            gradient: (P, blocks * N), changed in place.
+            weights: one array (..., P, inner) a part.
+            gradient: (..., P, blocks * N), changed in place.
         """
         width = self.inner.stop - self.inner.start
         padded: dict[int, Array] = {}
         for (part, slot), slope in zip(self.terms.places, slopes, strict=True):
             block, first = self.block(slot), self.reach[0] + slot.offset
             if self.fold is None:
-                target = gradient[:, block * self.sites : (block + 1) * self.sites]
+                target = gradient[..., block * self.sites : (block + 1) * self.sites]
             else:
                 if block not in padded:
-                    padded[block] = gradient[:, :1] * self.fold[:1] * 0
+                    padded[block] = gradient[..., :1] * self.fold[:1] * 0
                 target = padded[block]
-            target[:, first : first + width] += weights[part] * slope
+            target[..., first : first + width] += weights[part] * slope
         for block, columns in padded.items():
-            gradient[:, block * self.sites : (block + 1) * self.sites] += columns @ self.fold.T  # type: ignore[union-attr]
+            gradient[..., block * self.sites : (block + 1) * self.sites] += columns @ self.fold.T  # type: ignore[union-attr]
 
 
 # The samples, in the network's units --------------------------------------------------------------------------------------
@@ -285,8 +286,12 @@ def inputs(samples: Samples, times: Float[ndarray, " time"]) -> Float[ndarray, "
 
 
 def columns(samples: Samples, order: int) -> Float[ndarray, "time outputs"]:
-    """Write samples as the network's outputs: blocks of u and v, real before imaginary parts; NaN where not observed."""
-    fields = [samples.u]
+    """Write samples as the network's outputs: blocks of u and v, real before imaginary parts; NaN where not observed.
+
+    A complex value of which one part is missing is missing.
+    """
+    gap = complex(np.nan, np.nan) if samples.is_complex else np.nan
+    fields = [np.where(np.isnan(samples.u), gap, samples.u)]
     if order == 2:
         fields.append(np.full_like(samples.u, np.nan) if samples.v is None else samples.v)
     blocks = [part for one in fields for part in ((one.real, one.imag) if samples.is_complex else (one,))]
@@ -363,6 +368,8 @@ def initial_weights(
 class Workspace:
     """Arrays that every step writes anew: to allocate them each time would take longer than to fill them.
 
+    With members each has one more axis in front.
+
     Attributes:
         stacks: output of each hidden layer, values (R) above their derivatives by x (P): (R + P, width).
         slopes: 1 - h^2 of each hidden layer (R, width).
@@ -382,15 +389,17 @@ class Workspace:
     spare: list[Array]
 
 
-def workspace(form: Sequence[tuple[int, int]], rows: int, tangents: int, move: Callable[..., Any]) -> Workspace:
-    """Allocate for layers of these shapes, `rows` times and the derivative at `tangents` of them."""
+def workspace(
+    form: Sequence[tuple[int, int]], rows: int, tangents: int, move: Callable[..., Any], lead: tuple[int, ...] = ()
+) -> Workspace:
+    """Allocate for layers of these shapes, `rows` times and the derivative at `tangents` of them, for members in `lead`."""
     widths = [width for _, width in form[:-1]]
     total = rows + tangents
 
     def each(height: int) -> list[Any]:
-        return [move(np.zeros((height, width))) for width in widths]
+        return [move(np.zeros((*lead, height, width))) for width in widths]
 
-    out, pull = (move(np.zeros((total, form[-1][1]))) for _ in range(2))
+    out, pull = (move(np.zeros((*lead, total, form[-1][1]))) for _ in range(2))
     return Workspace(each(total), each(rows), each(tangents), out, pull, each(total), each(tangents))
 
 
@@ -400,32 +409,32 @@ def forward(layers: Sequence[Array], x: Array, work: Workspace, xp: Any) -> Arra
     With h = tanh(z): dh/dx = (1 - h^2) dz/dx. Values and tangents are rows of one matrix, so that a layer is one product.
 
     Args:
-        layers: one matrix (in + 1, out) a layer.
+        layers: one matrix (..., in + 1, out) a layer.
         x: scaled times (R, 1); the first P of them get their derivative as well.
         work: where the results go, and what `backward` needs of them.
         xp: numpy or torch.
 
     Returns:
-        the outputs (R + P, M), values above derivatives by x.
+        the outputs (..., R + P, M), values above derivatives by x.
     """
     rows = len(x)
     for number, layer in enumerate(layers[:-1]):
         stack, slope, rate = work.stacks[number], work.slopes[number], work.rates[number]
-        value = stack[:rows]
+        value = stack[..., :rows, :]
         if number == 0:
-            xp.multiply(x, layer[:1], out=value)
-            rate[:] = layer[:1]
+            xp.multiply(x, layer[..., :1, :], out=value)
+            rate[:] = layer[..., :1, :]
         else:
-            xp.matmul(work.stacks[number - 1], layer[:-1], out=stack)
-            rate[:] = stack[rows:]
-        value += layer[-1]
+            xp.matmul(work.stacks[number - 1], layer[..., :-1, :], out=stack)
+            rate[:] = stack[..., rows:, :]
+        value += layer[..., -1:, :]
         xp.tanh(value, out=value)
         xp.multiply(value, value, out=slope)
         slope *= -1
         slope += 1
-        xp.multiply(slope[: len(rate)], rate, out=stack[rows:])
-    xp.matmul(work.stacks[-1], layers[-1][:-1], out=work.out)
-    work.out[:rows] += layers[-1][-1]
+        xp.multiply(slope[..., : rate.shape[-2], :], rate, out=stack[..., rows:, :])
+    xp.matmul(work.stacks[-1], layers[-1][..., :-1, :], out=work.out)
+    work.out[..., :rows, :] += layers[-1][..., -1:, :]
     return work.out
 
 
@@ -443,21 +452,22 @@ def backward(layers: Sequence[Array], x: Array, work: Workspace, result: Sequenc
     gradient = work.pull
     for number in range(len(layers) - 1, 0, -1):
         stack, slope, rate = work.stacks[number - 1], work.slopes[number - 1], work.rates[number - 1]
-        xp.matmul(stack.T, gradient, out=result[number][:-1])
-        result[number][-1] = gradient[:rows].sum(0)
+        xp.matmul(stack.mT, gradient, out=result[number][..., :-1, :])
+        result[number][..., -1, :] = gradient[..., :rows, :].sum(-2)
         down, spare = work.pulls[number - 1], work.spare[number - 1]
-        xp.matmul(gradient, layers[number][:-1].T, out=down)
+        xp.matmul(gradient, layers[number][..., :-1, :].mT, out=down)
         # A tangent is s(z) z' with s = 1 - h^2; by z it gives -2 h s z'.
-        xp.multiply(stack[: len(rate)], rate, out=spare)
-        spare *= down[rows:]
+        points = rate.shape[-2]
+        xp.multiply(stack[..., :points, :], rate, out=spare)
+        spare *= down[..., rows:, :]
         spare *= 2
-        down[: len(rate)] -= spare
-        down[:rows] *= slope
-        down[rows:] *= slope[: len(rate)]
+        down[..., :points, :] -= spare
+        down[..., :rows, :] *= slope
+        down[..., rows:, :] *= slope[..., :points, :]
         gradient = down
-    result[0][:1] = x.T @ gradient[:rows]
-    result[0][0] += gradient[rows:].sum(0)
-    result[0][1] = gradient[:rows].sum(0)
+    result[0][..., :1, :] = x.mT @ gradient[..., :rows, :]
+    result[0][..., 0, :] += gradient[..., rows:, :].sum(-2)
+    result[0][..., 1, :] = gradient[..., :rows, :].sum(-2)
 
 
 # The loss -----------------------------------------------------------------------------------------------------------------
@@ -474,6 +484,8 @@ class Sheet:
 
 class Problem:
     """The loss of one network and the coefficients, and its gradient, on one trajectory and its mirrored companion.
+
+    For one network on NumPy arrays `...` below is nothing, else it is one axis of members.
 
     Attributes:
         form: the layers' shapes.
@@ -501,7 +513,7 @@ class Problem:
         self.units = self.move(np.repeat([size.field, size.velocity][:order], parts * samples.sites))
         self.form = shapes(settings.layers, settings.width, self.outputs * len(sheets))
         self.count = sum(rows * width for rows, width in self.form)
-        self.work = workspace(self.form, len(self.x), self.points, self.move)
+        self.work = workspace(self.form, len(self.x), self.points, self.move, settings.lead)
         self.sheets = []
         # Means over the samples and over the collocation points, shared among the sheets.
         self.data_weight = share * settings.data_weight / len(sheets)
@@ -520,91 +532,98 @@ class Problem:
             )
 
     def split(self, weights: Array) -> list[Array]:
-        """Cut the weights (count,) into one matrix a layer."""
+        """Cut the weights (..., count) into one matrix a layer."""
         layers, first = [], 0
         for rows, width in self.form:
-            layers.append(weights[first : first + rows * width].reshape(rows, width))
+            layers.append(weights[..., first : first + rows * width].reshape(*weights.shape[:-1], rows, width))
             first += rows * width
         return layers
 
-    def loss(self, weights: Array, xi: ndarray, gradient: Array, coefficient_gradient: ndarray) -> float:
-        """Give the loss; write its derivative by the weights and add that by the coefficients xi.
+    def loss(self, weights: Array, xi: Array, gradient: Array, coefficient_gradient: Array) -> Array:
+        """Give the loss (...); write its derivative by the weights and add that by the coefficients xi.
 
         Args:
-            weights: (count,).
-            xi: coefficients in the data's units (J,).
-            gradient: (count,), overwritten.
-            coefficient_gradient: (J,), added to.
+            weights: (..., count).
+            xi: coefficients in the data's units (..., J).
+            gradient: (..., count), overwritten.
+            coefficient_gradient: (..., J), added to.
         """
         xp, points, rows = self.xp, self.points, len(self.x)
         layers = self.split(weights)
         out, pull = forward(layers, self.x, self.work, xp), self.work.pull
-        total = 0.0
+        total: Array = 0.0
         for number, sheet in enumerate(self.sheets):
             block = slice(number * self.outputs, (number + 1) * self.outputs)
-            miss = out[points:rows, block] - sheet.data
+            miss = out[..., points:rows, block] - sheet.data
             weighted = miss * sheet.seen
-            total += self.data_weight * float((weighted * miss).sum())
-            pull[points:rows, block] = (2 * self.data_weight) * weighted
-            total += self._residuals(sheet, out, pull, block, xi, coefficient_gradient)
+            total = total + self.data_weight * (weighted * miss).sum((-2, -1))
+            pull[..., points:rows, block] = (2 * self.data_weight) * weighted
+            total = total + self._residuals(sheet, out, pull, block, xi, coefficient_gradient)
         backward(layers, self.x, self.work, self.split(gradient), xp)
         return total
 
     def _residuals(
-        self, sheet: Sheet, out: Array, pull: Array, block: slice, xi: ndarray, coefficient_gradient: ndarray
-    ) -> float:
+        self, sheet: Sheet, out: Array, pull: Array, block: slice, xi: Array, coefficient_gradient: Array
+    ) -> Array:
         points, rows = self.points, len(self.x)
-        law = sheet.equation
-        fields = out[:points, block] * self.units
-        rates = out[rows:, block] * (self.units / self.half)
+        law, factors = sheet.equation, multipliers(xi)
+        fields = out[..., :points, block] * self.units
+        rates = out[..., rows:, block] * (self.units / self.half)
         by_fields, by_rates = self.xp.zeros_like(fields), self.xp.zeros_like(rates)
-        values = law.terms.function(*law.windows(fields), *xi.tolist())
+        values = law.terms.function(*law.windows(fields), *factors)
         slopes = values[law.count * law.parts :]
-        total, weights = 0.0, []
+        total: Array = 0.0
+        weights = []
         width = law.inner.stop - law.inner.start
         scale = self.residual_weight / (self.size.rate**2 * points * width)
         for part in range(law.parts):
             terms = values[part * law.count : (part + 1) * law.count]
             where = law.rate_columns(part)
-            left = rates[:, where] * 1.0
-            for x, term in zip(xi.tolist(), terms, strict=True):
+            left = rates[..., where] * 1.0
+            for x, term in zip(factors, terms, strict=True):
                 left -= x * term
-            total += scale * float((left * left).sum())
+            total = total + scale * (left * left).sum((-2, -1))
             left *= 2 * scale
-            by_rates[:, where] += left
-            coefficient_gradient -= [float((left * term).sum()) for term in terms]
+            by_rates[..., where] += left
+            coefficient_gradient -= self.xp.stack([(left * term).sum((-2, -1)) for term in terms], -1)
             weights.append(-left)
         law.pull_back(slopes, weights, by_fields)
         if self.order == 2:
             half = law.parts * law.sites
-            gap = rates[:, :half] - fields[:, half:]
+            gap = rates[..., :half] - fields[..., half:]
             scale = self.residual_weight / (self.size.velocity**2 * points * law.sites)
-            total += scale * float((gap * gap).sum())
+            total = total + scale * (gap * gap).sum((-2, -1))
             gap *= 2 * scale
-            by_rates[:, :half] += gap
-            by_fields[:, half:] -= gap
-        pull[:points, block] = by_fields * self.units
-        pull[rows:, block] = by_rates * (self.units / self.half)
+            by_rates[..., :half] += gap
+            by_fields[..., half:] -= gap
+        pull[..., :points, block] = by_fields * self.units
+        pull[..., rows:, block] = by_rates * (self.units / self.half)
         return total
 
-    def left(self, weights: Array, xi: ndarray) -> tuple[float, float, int]:
-        """Give the sums of squares of rate - library and of the rate, over the collocation points, and their number."""
+    def left(self, weights: Array, xi: Array) -> tuple[Array, Array]:
+        """Give the sums of squares (...) of rate - library and of the rate, over the collocation points."""
         out = forward(self.split(weights), self.x, self.work, self.xp)
-        missed, whole, count = 0.0, 0.0, 0
+        missed: Array = 0.0
+        whole: Array = 0.0
+        factors = multipliers(xi)
         for number, sheet in enumerate(self.sheets):
             law = sheet.equation
             block = slice(number * self.outputs, (number + 1) * self.outputs)
-            fields = out[: self.points, block] * self.units
-            rates = out[len(self.x) :, block] * (self.units / self.half)
-            values = law.terms.function(*law.windows(fields), *xi.tolist())
+            fields = out[..., : self.points, block] * self.units
+            rates = out[..., len(self.x) :, block] * (self.units / self.half)
+            values = law.terms.function(*law.windows(fields), *factors)
             for part in range(law.parts):
-                rate = rates[:, law.rate_columns(part)]
+                rate = rates[..., law.rate_columns(part)]
                 terms = values[part * law.count : (part + 1) * law.count]
-                gap = rate - sum(x * term for x, term in zip(xi.tolist(), terms, strict=True))
-                missed += float((gap * gap).sum())
-                whole += float((rate * rate).sum())
-                count += self.points
-        return missed, whole, count
+                gap = rate - sum(x * term for x, term in zip(factors, terms, strict=True))
+                missed = missed + (gap * gap).sum((-2, -1))
+                whole = whole + (rate * rate).sum((-2, -1))
+        return missed, whole
+
+
+def multipliers(xi: Array) -> list[Any]:
+    """Give each coefficient as it multiplies a term (..., P, inner): a number for one network, (K, 1, 1) for members."""
+    return list(xi.tolist()) if xi.ndim == 1 else [xi[:, k, None, None] for k in range(xi.shape[1])]
 
 
 def arrays(device: str) -> tuple[Any, Callable[..., Any]]:
@@ -638,50 +657,69 @@ def one_thread() -> Iterator[None]:
 
 
 class Diary:
-    """Records the way of the coefficients.
+    """Records the way of the coefficients, of one network or of several members.
 
     Attributes:
         every: steps between two records.
     """
 
-    def __init__(self, every: int) -> None:
-        """Start the clock."""
+    def __init__(self, every: int, since: float | None = None) -> None:
+        """Start the clock, now or when `time.perf_counter()` was `since`."""
         self.every = every
-        self.start = time.perf_counter()
+        self.start = time.perf_counter() if since is None else since
         self.step: list[int] = []
         self.seconds: list[float] = []
-        self.loss: list[float] = []
+        self.loss: list[Any] = []
         self.coefficients: list[ndarray] = []
 
-    def note(self, step: int, loss: float, coefficients: ndarray, *, always: bool = False) -> None:
-        """Record a step if its turn has come, or `always`; a step that is there already is left as it is."""
-        last = self.step[-1] if self.step else -self.every
-        if step >= last + self.every or (always and step > last):
+    def due(self, step: int) -> bool:
+        """Say whether a step's turn to be recorded has come."""
+        return step >= (self.step[-1] if self.step else -self.every) + self.every
+
+    def note(self, step: int, loss: Any, coefficients: ndarray, *, always: bool = False) -> None:
+        """Record a step if its turn has come, or `always`; a step that is there already is left as it is.
+
+        Args:
+            step: its number.
+            loss: a number, or one a member.
+            coefficients: (J,), or one row a member.
+            always: whether its turn has come or not.
+        """
+        if self.due(step) or (always and step > self.step[-1]):
             self.step.append(step)
             self.seconds.append(time.perf_counter() - self.start)
             self.loss.append(loss)
             self.coefficients.append(np.array(coefficients))
 
-    def history(self) -> History:
-        """Give the records."""
+    def history(self, member: int | None = None) -> History:
+        """Give the records, of one member where there are several."""
+        of = ... if member is None else np.s_[:, member]
         return History(
-            np.array(self.step, dtype=float), np.array(self.seconds), np.array(self.loss), np.array(self.coefficients)
+            np.array(self.step, dtype=float),
+            np.array(self.seconds),
+            np.array(self.loss)[of],
+            np.array(self.coefficients)[of],
         )
 
 
 def adam(
-    evaluate_at: Evaluate, start: ndarray, steps: int, learning_rate: float, note: Callable[[int, float, ndarray], None]
-) -> ndarray:
+    evaluate_at: Evaluate,
+    start: Array,
+    steps: int,
+    learning_rate: float,
+    note: Callable[[int, Any, Array], None],
+    xp: Any = np,
+) -> Array:
     """Minimise by Adam (Kingma & Ba, 2015), the learning rate falling to 0 along half a cosine."""
-    point = start.copy()
-    mean, square = np.zeros_like(point), np.zeros_like(point)
+    point = start * 1.0
+    mean, square = xp.zeros_like(point), xp.zeros_like(point)
     for step in range(steps):
         value, gradient = evaluate_at(point)
         note(step, value, point)
         mean += 0.1 * (gradient - mean)
         square += 0.001 * (gradient * gradient - square)
         rate = learning_rate * 0.5 * (1 + math.cos(math.pi * step / steps)) / (1 - 0.9 ** (step + 1))
-        point -= rate * mean / (np.sqrt(square / (1 - 0.999 ** (step + 1))) + 1e-8)
+        point -= rate * mean / (xp.sqrt(square / (1 - 0.999 ** (step + 1))) + 1e-8)
     return point
 
 
@@ -715,6 +753,97 @@ def lbfgs(
     return point
 
 
+# Tries of a line search before it gives up.
+SEARCH = 30
+
+
+def lockstep(
+    evaluate_at: Evaluate, start: Array, steps: int, memory: int, note: Callable[[int, Any, Array], None], xp: Any
+) -> Array:
+    """Minimise the losses of several members by L-BFGS, each on its own way, with one evaluation for all at a time.
+
+    Each member looks for a step with the weak Wolfe conditions by bisection and doubling (Lewis & Overton, Math. Program. 141,
+    135 (2013)). One that found it moves on while the others still look; what it does not add in that round is an
+    empty pair in the shared memory. One whose search ends in nothing starts again downhill with an empty memory, once.
+
+    Args:
+        evaluate_at: gives the losses (K,) and gradients (K, n) at the points (K, n).
+        start: the points (K, n).
+        steps: most evaluations.
+        memory: how many pairs are remembered.
+        note: is told the evaluation's number, the losses and the points.
+        xp: numpy or torch.
+    """
+
+    def dot(a: Array, b: Array) -> Array:
+        return xp.einsum("kn,kn->k", a, b)
+
+    point = start * 1.0
+    value, gradient = evaluate_at(point)
+    pairs = [(xp.zeros_like(point), xp.zeros_like(point), xp.zeros_like(value)) for _ in range(memory)]
+    zero, one = xp.zeros_like(value), xp.ones_like(value)
+    size = zero
+    way, slope = -gradient, -dot(gradient, gradient)
+    # The first step has length 1 at most.
+    length = 1 / xp.sqrt(xp.where(slope < -1, -slope, one))
+    low, high = zero, zero + math.inf
+    fresh, alive, tries = zero == 0, slope < 0, zero
+    for done in range(1, steps):
+        trial = point + xp.where(alive, length, zero)[:, None] * way
+        lower, steeper = evaluate_at(trial)
+        rise = dot(steeper, way)
+        short = alive & (lower <= value + 1e-4 * length * slope)
+        found = short & (rise >= 0.9 * slope)
+        low, high = xp.where(short, length, low), xp.where(alive & ~short, length, high)
+        if bool(found.any()):
+            moved = xp.where(found, length, zero)[:, None] * way
+            turned = xp.where(found[:, None], steeper - gradient, xp.zeros_like(gradient))
+            product, square = dot(moved, turned), dot(turned, turned)
+            curved = product > 1e-14 * square
+            weight = xp.where(curved, 1 / xp.where(curved, product, one), zero)
+            pairs = [*pairs[1:], (moved, turned, weight)]
+            size = xp.where(curved, product / xp.where(curved, square, one), size)
+            value, point = xp.where(found, lower, value), point + moved
+            gradient = xp.where(found[:, None], steeper, gradient)
+            note(done, value, point)
+            ahead = -_inverse(pairs, size, gradient, dot)
+            way = xp.where(found[:, None], ahead, way)
+        slope = dot(gradient, way)
+        # Nothing found in many tries, or no way down: forget the pairs and go downhill, once.
+        tries = xp.where(found, zero, tries + 1)
+        lost = alive & ((tries >= SEARCH) | (slope >= 0))
+        if bool(lost.any()):
+            alive = alive & ~(lost & fresh & ~found)
+            keep = xp.where(lost, zero, one)
+            pairs = [(moved, turned, weight * keep) for moved, turned, weight in pairs]
+            way = xp.where(lost[:, None], -gradient, way)
+            slope = xp.where(lost, -dot(gradient, gradient), slope)
+            alive, tries = alive & (slope < 0), xp.where(lost, zero, tries)
+            if not bool(alive.any()):
+                break
+        fresh = xp.where(found | lost, lost, fresh)
+        middle = xp.where(xp.isinf(high), 2 * length, (low + high) / 2)
+        downhill = 1 / xp.sqrt(xp.where(slope < -1, -slope, one))
+        length = xp.where(lost, downhill, xp.where(found, one, middle))
+        low, high = xp.where(found | lost, zero, low), xp.where(found | lost, zero + math.inf, high)
+    return point
+
+
+def _inverse(
+    pairs: Sequence[tuple[Array, Array, Array]], size: Array, gradient: Array, dot: Callable[..., Any]
+) -> Array:
+    """Multiply by the inverse Hessian that the pairs approximate (Nocedal & Wright, Numerical Optimization, algorithm 7.4)."""
+    left = gradient * 1.0
+    shares = []
+    for moved, turned, weight in reversed(pairs):
+        shares.append(weight * dot(moved, left))
+        left -= shares[-1][:, None] * turned
+    left *= size[:, None]
+    for (moved, turned, weight), share in zip(pairs, reversed(shares), strict=True):
+        left += (share - weight * dot(turned, left))[:, None] * moved
+    return left
+
+
 @dataclass(frozen=True)
 class PINN:
     """The paper's network; see the module for its loss.
@@ -731,7 +860,11 @@ class PINN:
         adam_steps, learning_rate: steps of Adam, and its first learning rate; it falls to 0 along half a cosine.
         lbfgs_steps, memory: evaluations of L-BFGS, and how many steps it remembers.
         record: steps between two records of the coefficients.
-        device: cpu, or a device of torch's such as cuda.
+        device: cpu, or a device of torch's such as cuda; cpu:0 is torch on the processor.
+        members: networks with different first weights; the one with the least loss is the fit, and `found` has the standard
+            deviation of each coefficient over them. On a device they take one step together and L-BFGS is `lockstep`; eight
+            of them cost 0.74 of eight single ones on torch with one thread of a processor. On NumPy arrays one trains after
+            the other, as a batch of eight cost 1.26 there.
 
     Raises:
         InputError: a number is too small.
@@ -751,11 +884,13 @@ class PINN:
     memory: int = 20
     record: int = 100
     device: str = "cpu"
+    members: int = 1
 
     def __post_init__(self) -> None:
         """Check the settings."""
         for name, least in (
             ("layers", 1), ("width", 1), ("collocation", 2), ("adam_steps", 0), ("lbfgs_steps", 0), ("memory", 1), ("record", 1),
+            ("members", 1),
         ):  # fmt: skip
             if getattr(self, name) < least:
                 raise InputError(
@@ -767,9 +902,14 @@ class PINN:
                 raise InputError(f"method {self.name!r}: setting {name} = {value!r}; it must be a number above 0")
 
     @property
+    def lead(self) -> tuple[int, ...]:
+        """The axes in front of a network's own: one of members on a device, none on NumPy arrays."""
+        return () if self.device == "cpu" else (self.members,)
+
+    @property
     def abilities(self) -> Abilities:
         """Everything but the truth."""
-        return Abilities(missing=True)
+        return Abilities(missing=True, loads=() if self.device == "cpu" else ("torch",))
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Train weights and coefficients together; several trajectories have networks of their own and share coefficients.
@@ -778,51 +918,105 @@ class PINN:
             InputError: torch does not have the device.
         """
         size = scales(data, library, order)
-        units = self.coefficient_scale * size.coefficients()
         problems = [
             Problem([s, s.mirrored()] if self.mirror else [s], library, order, size, self, 1 / len(data)) for s in data
         ]
-        draw = np.random.default_rng(seed)
-        pieces = [initial_weights(problem.form, self.frequency, draw) for problem in problems]
-        theta = np.concatenate([*pieces, np.zeros(len(units))])
-        bounds = np.cumsum([0, *(len(piece) for piece in pieces)])
-        diary = Diary(self.record)
+        units = problems[0].move(self.coefficient_scale * size.coefficients())
+        draws = member_draws(seed, self.members)
+        since = time.perf_counter()
+        with one_thread(), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            ends = [
+                end
+                for group in ([draws] if self.lead else [[draw] for draw in draws])
+                for end in self._train(problems, group, units, since)
+            ]
+        best = ends[best_member(np.array([end.loss for end in ends]))]
+        found = {"loss": best.loss, **spread(np.array([end.coefficients for end in ends]), library)}
+        return Fit(self.name, library, order, best.coefficients, best.residual, history=best.history, found=found)
 
-        def value_and_gradient(point: ndarray) -> tuple[float, ndarray]:
-            gradient = np.zeros_like(point)
-            by_coefficients = np.zeros(len(units))
-            xi = point[bounds[-1] :] * units
+    def _train(
+        self, problems: Sequence[Problem], draws: Sequence[np.random.Generator], units: Array, since: float
+    ) -> list[End]:
+        """Train one network, or the members of a batch; `units` are those of the coefficients in the optimisers."""
+        xp, move = problems[0].xp, problems[0].move
+        bounds = [0, *itertools.accumulate(problem.count for problem in problems)]
+        first_weights = [
+            np.concatenate([initial_weights(problem.form, self.frequency, draw) for problem in problems])
+            for draw in draws
+        ]
+        start = np.pad(np.stack(first_weights), ((0, 0), (0, len(units))))
+        theta = move(start.reshape(*self.lead, -1))
+        diary = Diary(self.record, since)
+
+        def coefficients(point: Array) -> Array:
+            return point[..., bounds[-1] :] * units
+
+        def value_and_gradient(point: Array) -> tuple[Array, Array]:
+            gradient, xi = xp.zeros_like(point), coefficients(point)
+            by_coefficients = xp.zeros_like(xi)
             total = 0.0
             for problem, first, last in zip(problems, bounds[:-1], bounds[1:], strict=True):
-                if problem.xp is np:
-                    total += problem.loss(point[first:last], xi, gradient[first:last], by_coefficients)
-                else:
-                    moved = problem.xp.empty(last - first, dtype=problem.x.dtype, device=problem.x.device)
-                    total += problem.loss(problem.move(point[first:last]), xi, moved, by_coefficients)
-                    gradient[first:last] = moved.cpu().numpy()
-            gradient[bounds[-1] :] = by_coefficients * units
+                total = total + problem.loss(point[..., first:last], xi, gradient[..., first:last], by_coefficients)
+            gradient[..., bounds[-1] :] = by_coefficients * units
             return total, gradient
 
-        def note(step: int, loss: float, point: ndarray) -> None:
-            diary.note(step, loss, point[bounds[-1] :] * units)
+        def note(step: int, loss: Array, point: Array) -> None:
+            if diary.due(step):
+                diary.note(step, host(loss), host(coefficients(point)))
 
-        with one_thread(), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            theta = adam(value_and_gradient, theta, self.adam_steps, self.learning_rate, note)
-            offset = self.adam_steps
-            theta = lbfgs(
-                value_and_gradient, theta, self.lbfgs_steps, self.memory,
-                lambda step, value, point: note(offset + step, value, point),
-            )  # fmt: skip
-            loss, _ = value_and_gradient(theta)
-            xi = theta[bounds[-1] :] * units
-            diary.note(offset + self.lbfgs_steps, loss, xi, always=True)
-            parts = [
-                problem.left(problem.move(theta[first:last]), xi)
-                for problem, first, last in zip(problems, bounds[:-1], bounds[1:], strict=True)
-            ]
-        missed, whole = sum(part[0] for part in parts), sum(part[1] for part in parts)
-        residual = math.sqrt(missed / whole) if whole > 0 else math.sqrt(missed)
-        return Fit(self.name, library, order, xi, residual, history=diary.history(), found={"loss": loss})
+        def later(step: int, loss: Array, point: Array) -> None:
+            note(self.adam_steps + step, loss, point)
+
+        theta = adam(value_and_gradient, theta, self.adam_steps, self.learning_rate, note, xp)
+        if self.lead:
+            theta = lockstep(value_and_gradient, theta, self.lbfgs_steps, self.memory, later, xp)
+        else:
+            theta = lbfgs(value_and_gradient, theta, self.lbfgs_steps, self.memory, later)
+        loss, xi = host(value_and_gradient(theta)[0]), coefficients(theta)
+        diary.note(self.adam_steps + self.lbfgs_steps, loss, host(xi), always=True)
+        parts = [
+            problem.left(theta[..., first:last], xi)
+            for problem, first, last in zip(problems, bounds[:-1], bounds[1:], strict=True)
+        ]
+        missed, whole = (host(sum(part[k] for part in parts)) for k in range(2))
+        residual = np.sqrt(np.where(whole > 0, missed / whole, missed))
+        return [
+            End(float(loss[of]), host(xi)[of], float(residual[of]), diary.history(of[0] if of else None))
+            for of in np.ndindex(*self.lead)
+        ]
+
+
+class End(NamedTuple):
+    """Where a member ended: its loss, coefficients, residual and way there."""
+
+    loss: float
+    coefficients: ndarray
+    residual: float
+    history: History
+
+
+def host(array: Array) -> ndarray:
+    """Bring an array, or a number, from its device."""
+    return np.asarray(array.cpu() if hasattr(array, "cpu") else array)
+
+
+def member_draws(seed: int, members: int) -> list[np.random.Generator]:
+    """Give each member's generator; the first is that of one network alone."""
+    return [np.random.default_rng([seed, member] if member else seed) for member in range(members)]
+
+
+def best_member(loss: Float[ndarray, " member"]) -> int:
+    """Say which member has the least loss; one whose loss is not finite is not it, unless all are so."""
+    return int(np.argmin(np.where(np.isfinite(loss), loss, np.inf)))
+
+
+def spread(coefficients: Float[ndarray, "member terms"], library: Library) -> dict[str, float]:
+    """Give the members' number and the standard deviation of each coefficient over them, in its units; nothing for one."""
+    if len(coefficients) == 1:
+        return {}
+    deviations = np.std(coefficients, axis=0, ddof=1)
+    names = (f"spread of {text}" for text in library.texts)
+    return {"members": float(len(coefficients)), **dict(zip(names, deviations.tolist(), strict=True))}
 
 
 METHODS = (PINN,)

@@ -25,11 +25,11 @@ from systems.lattice import Library
 from systems.samples import Samples
 
 
-def sparse_fit(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> np.ndarray:
-    """Fit scaled rows with one of pysindy's optimisers, made afresh, and give the coefficients in the data's units.
+def optimise(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> Any:
+    """Fit scaled rows with one of pysindy's optimisers, made afresh; its `coef_` are the terms' shares of the derivative.
 
     Raises:
-        InputError: there is no such optimiser, or it refuses its arguments.
+        InputError: there is no such optimiser, or it refuses its arguments or the rows.
     """
     import pysindy.optimizers
     from pysindy.optimizers import BaseOptimizer
@@ -41,7 +41,6 @@ def sparse_fit(regression: Regression, optimizer: str, arguments: Mapping[str, A
     if optimizer not in known:
         error = unknown("pysindy optimiser", optimizer, known)
         raise InputError(f"{error}; pysindy leaves out those whose solver is not installed (such as cvxpy)")
-    scale = regression.scales
     height = np.sqrt(np.mean(regression.target**2)) or 1.0
     # Bagging draws from NumPy's global generator (pysindy 2.1), so it is seeded here and put back.
     state = np.random.get_state()  # noqa: NPY002
@@ -49,14 +48,22 @@ def sparse_fit(regression: Regression, optimizer: str, arguments: Mapping[str, A
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            fitted = getattr(pysindy.optimizers, optimizer)(**arguments).fit(
-                regression.design / (scale * height), regression.target[:, None] / height
+            return getattr(pysindy.optimizers, optimizer)(**arguments).fit(
+                regression.design / (regression.scales * height), regression.target[:, None] / height
             )
     except Exception as error:
         raise InputError(f"pysindy's {optimizer} with {dict(arguments)}: {error}") from error
     finally:
         np.random.set_state(state)  # noqa: NPY002
-    coefficients: np.ndarray = np.asarray(fitted.coef_)[0] / scale
+
+
+def sparse_fit(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> np.ndarray:
+    """Fit with one of pysindy's optimisers as `optimise` does, and give the coefficients (terms,) in the data's units.
+
+    Raises:
+        InputError: there is no such optimiser, or it refuses its arguments or the rows.
+    """
+    coefficients: np.ndarray = np.asarray(optimise(regression, optimizer, arguments, seed).coef_)[0] / regression.scales
     return coefficients
 
 

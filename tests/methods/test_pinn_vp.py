@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import systems
+from methods import pinn_vp
 from methods.method import Skipped, make, solve
-from methods.pinn import scales
-from methods.pinn_vp import PINNVP, Curve, hidden, step
+from methods.pinn import member_draws, scales
+from methods.pinn_vp import PINNVP, Algebra, Curve, hidden, step
 from systems.errors import InputError
 from systems.lattice import library
 from systems.samples import Samples
@@ -62,8 +63,9 @@ def test_the_right_hand_side_is_minus_half_the_slope_of_the_objective(name):
     candidates = library("lib", texts)
     draw = np.random.default_rng(1)
     curve = Curve(
-        samples, candidates, order, scales([samples], candidates, order), PINNVP(width=6, collocation=21), draw
-    )
+        samples, candidates, order, scales([samples], candidates, order), PINNVP(width=6, collocation=21), [draw],
+        Algebra("cpu"),
+    )  # fmt: skip
     a, xi = curve.weights + 0.1 * draw.normal(size=curve.weights.shape), draw.normal(size=len(candidates.terms))
     matrix, right = curve.normal(a, xi, 0.7)
     np.testing.assert_allclose(matrix, matrix.T, rtol=1e-9, atol=1e-9 * np.max(np.abs(matrix)))
@@ -83,11 +85,12 @@ def test_a_step_and_the_trace_of_the_hat_matrix_are_those_of_plain_linear_algebr
     samples, texts, order = CASES["interior sites"]
     candidates = library("lib", texts)
     settings = PINNVP(width=5, collocation=21)
-    curve = Curve(samples, candidates, order, scales([samples], candidates, order), settings, np.random.default_rng(2))
+    size = scales([samples], candidates, order)
+    curve = Curve(samples, candidates, order, size, settings, [np.random.default_rng(2)], Algebra("cpu"))
     xi = np.array([0.5, 0.2, -0.3, 0.1])
     matrix, right = curve.normal(curve.weights, xi, 0.3)
     change = np.linalg.solve(matrix, right)
-    found = step([curve], [curve.weights], xi, 0.3, 0.0, hat=True)
+    found = step([curve], [curve.weights], xi, 0.3, np.float64(0.0), hat=True)
     np.testing.assert_allclose(found.coefficients - xi, change[curve.unknowns :], rtol=1e-5, atol=1e-8)
     moved = change[: curve.unknowns].reshape(curve.outputs, curve.units).T
     np.testing.assert_allclose(found.weights[0] - curve.weights, moved, rtol=1e-4, atol=1e-7)
@@ -166,7 +169,101 @@ def test_too_many_unknowns_are_a_reason_to_skip():
         solve(PINNVP(), [chain(400)], library("lib", "u[n]"), 2, 0)
 
 
-@pytest.mark.parametrize(("name", "value"), [("width", 0), ("weights", []), ("tolerance", -1.0)])
+@pytest.mark.parametrize(("name", "value"), [("width", 0), ("weights", []), ("tolerance", -1.0), ("members", 0)])
 def test_unsound_settings_are_named(name, value):
     with pytest.raises(InputError, match=name):
         make(PINNVP, {name: value})
+
+
+def noisy(samples: Samples, sigma: float, seed: int) -> Samples:
+    assert samples.v is not None
+    draw = np.random.default_rng(seed)
+    u, v = (field + sigma * draw.normal(size=field.shape) for field in (samples.u, samples.v))
+    return Samples(samples.t, u, v)
+
+
+def gappy(samples: Samples) -> Samples:
+    u = samples.u.copy()
+    u[np.random.default_rng(4).uniform(size=u.shape) < 0.2] = np.nan
+    return Samples(samples.t, u)
+
+
+def test_one_network_on_the_processor_has_the_numbers_that_it_had_before_there_were_devices():
+    samples, _ = oscillators()
+    # Written down with the code as it was.
+    before = [
+        (gappy(samples), [-2.0081096628073265, 0.00325133699155257], [0.18382252093121895, 0.1096253522903831]),
+        (
+            noisy(samples, 0.02, 1),
+            [-2.0097133029221546, -8.2634476381706471e-05],
+            [0.06417826153721297, 0.03833170782768845],
+        ),
+    ]
+    for data, coefficients, stderr in before:
+        fit = solve(PINNVP(**SMALL), [data], library("lib", "u[n]; u[n]**3"), 2, 0)
+        np.testing.assert_allclose(fit.coefficients, coefficients, rtol=1e-6, atol=1e-7)
+        assert fit.stderr is not None
+        np.testing.assert_allclose(fit.stderr, stderr, rtol=1e-6)
+        assert set(fit.found) == {"weight", "noise"}
+
+
+DATA = {
+    "exact": ([oscillators()[0]], "u[n]; u[n]**3", 2),
+    "noisy": ([noisy(oscillators()[0], 0.02, 3)], "u[n]; u[n]**3", 2),
+    "missing values, two trajectories": ([gappy(oscillators()[0]), oscillators(2)[0]], "u[n]; u[n]**3", 2),
+    "complex, periodic": ([chain(4, "periodic", is_complex=True)], "i*u[n]; u[n+1]; abs(u[n])**2*u[n]", 1),
+    "a term that is a number": ([chain(3, "free")], "u[n]; 1; v[n]", 2),
+}
+
+
+@pytest.mark.parametrize("name", DATA)
+@pytest.mark.parametrize("members", [1, 3])
+def test_torch_on_the_processor_agrees_with_numpy_for_one_network_and_for_a_batch(name, members):
+    pytest.importorskip("torch")
+    data, texts, order = DATA[name]
+    candidates = library("lib", texts)
+    plain, torch = (
+        solve(PINNVP(**SMALL, members=members, device=device), data, candidates, order, 5)
+        for device in ("cpu", "cpu:0")
+    )
+    scale = np.max(np.abs(plain.coefficients))
+    np.testing.assert_allclose(torch.coefficients, plain.coefficients, rtol=1e-7, atol=1e-8 * scale)
+    assert plain.stderr is not None
+    np.testing.assert_allclose(torch.stderr, plain.stderr, rtol=1e-5)
+    assert torch.found.keys() == plain.found.keys()
+    for key, value in plain.found.items():
+        assert torch.found[key] == pytest.approx(value, rel=1e-4, abs=1e-8 * scale), key
+
+
+def test_of_several_members_the_best_is_the_fit_and_their_spread_is_that_of_the_single_ones(monkeypatch):
+    data, candidates = [noisy(oscillators()[0], 0.02, 3)], library("lib", "u[n]; u[n]**3")
+    whole = solve(PINNVP(**SMALL, members=3), data, candidates, 2, 5)
+    alone = []
+    for draw in range(3):
+        monkeypatch.setattr(pinn_vp, "member_draws", lambda seed, _members, k=draw: member_draws(seed, 3)[k : k + 1])
+        alone.append(solve(PINNVP(**SMALL), data, candidates, 2, 5))
+    best = min(alone, key=lambda fit: fit.found["noise"])
+    assert np.array_equal(whole.coefficients, best.coefficients)
+    assert whole.found["noise"] == best.found["noise"]
+    spread = np.std([fit.coefficients for fit in alone], axis=0, ddof=1)
+    found = [whole.found[f"spread of {text}"] for text in candidates.texts]
+    np.testing.assert_allclose(found, spread, rtol=1e-12)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cpu:0"])
+def test_a_matrix_that_cannot_be_factorised_is_told_and_the_others_are_right(device):
+    pytest.importorskip("torch")
+    algebra = Algebra(device)
+    good = np.array([[4.0, 1.0], [1.0, 3.0]])
+    bad = np.array([[1.0, 2.0], [2.0, 1.0]])
+    batches = [good, bad] if device == "cpu" else [np.stack([good, bad])]
+    results = [algebra.cholesky(algebra.move(one.copy())) for one in batches]
+    sound = np.concatenate([np.atleast_1d(np.asarray(one)) for _, one in results])
+    assert sound.tolist() == [True, False]
+    factor = results[0][0]
+    right = algebra.move(np.ones((2, 1)) if device == "cpu" else np.ones((2, 2, 1)))
+    solved, inverse = np.asarray(algebra.solve(factor, right)), np.asarray(algebra.inverse(factor))
+    if device != "cpu":
+        solved, inverse = solved[0], inverse[0]
+    np.testing.assert_allclose(good @ solved, np.ones((2, 1)), rtol=1e-14)
+    np.testing.assert_allclose(np.tril(inverse).T @ np.tril(inverse) @ good, np.eye(2), atol=1e-14)
