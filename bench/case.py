@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 import methods
+from bench.limit import Limit, bound_of
 from bench.score import Forecast, forecast, score
 from bench.suite import Case
 from methods.method import Fit, Skipped, make, solve
@@ -35,6 +36,8 @@ from systems.simulate import observe, sample_times, simulate
 # Points kept of a method's history: enough for a figure, small enough for a store.
 MAX_RECORDS = 200
 MAX_REASON = 300
+# Sites x samples x trajectories up to which the bound takes some seconds at most.
+MOST_BOUNDED = 30_000
 
 
 def run_case(case: Case, base: Path) -> dict[str, Any]:
@@ -74,6 +77,7 @@ def blank(case: Case, status: str = "ok", reason: str = "") -> dict[str, Any]:
         "coefficients": None, "truth": None, "stderr": None, "note": "", "order": None,
         "e2": None, "einf": None, "spurious": None, "tpr": None,
         "forecast_error": None, "forecast_horizon": None, "residual": None, "conditioning": None,
+        "bound": None, "bounds": None, "verdicts": None,
         "seconds": None, "cpu_seconds": None, "peak_mib": None, "history": None, "found": {},
     }  # fmt: skip
 
@@ -104,8 +108,55 @@ def _fill(result: dict[str, Any], case: Case, base: Path) -> None:
     if truth is not None:
         found = score(fit.coefficients, truth, exact.scales)
         result.update(e2=_plain(found.e2), einf=_plain(found.einf), spurious=_plain(found.spurious), tpr=found.tpr)
+        result.update(_floor(case, base))
     told = _foretell(case, system, candidates, fit)
     result.update(forecast_error=_plain(told.error), forecast_horizon=round(told.horizon, 6))
+
+
+def _floor(case: Case, base: Path) -> dict[str, Any]:
+    """Give E2 at the Cramer-Rao bound, the smallest standard error of each coefficient, and a verdict on it.
+
+    Empty without noise, and where it would take too long.
+    """
+    system, _ = case.resolve(base)
+    # Unknown ends cost as much again: their motion is unknown too.
+    work = (case.sites or system.sites) * case.samples * case.trajectories * (1 if case.known_ends else 2)
+    if not case.noise or work > MOST_BOUNDED:
+        return {}
+    try:
+        limit = bound(case, base)
+    except (InputError, MemoryError, np.linalg.LinAlgError):
+        return {}
+    texts = limit.library.texts
+    return {
+        "bound": _plain(limit.relative),
+        "bounds": dict(zip(texts, map(_plain, limit.stderr), strict=True)),
+        "verdicts": dict(zip(texts, limit.verdicts, strict=True)),
+    }
+
+
+def bound(case: Case, base: Path) -> Limit:
+    """Give the Cramer-Rao bound for a case's samples and library.
+
+    Raises:
+        InputError: there is no noise, the equation is outside the library, or something is unsound.
+    """
+    # The noise scales the bound, and its seed matters only where it chooses what is seen.
+    seed = case.seed if case.uneven or case.missing > 0 or case.trajectories > 1 else 0
+    alike = case.model_copy(
+        update={
+            "noise": 1.0, "seed": seed, "mirror": False, "label": "", "method": "", "settings": {}, "part": "",
+            "time_limit": 1.0, "memory_limit": 1,
+        }
+    )  # fmt: skip
+    return _bound(alike.model_dump_json(), _stamp(case.system, base), base).at(case.noise)
+
+
+@functools.lru_cache(maxsize=32)
+def _bound(text: str, stamp: int, base: Path) -> Limit:  # noqa: ARG001
+    case = Case.model_validate_json(text)
+    system, candidates = case.resolve(base)
+    return bound_of(samples(case, base), candidates, system.order, noise=case.noise)
 
 
 def seed_of(base: int, *parts: str) -> int:

@@ -1,10 +1,11 @@
-"""The command line: `latticebench list|simulate|fit|run|table|figures|compare`.
+"""The command line: `latticebench list|simulate|fit|diagnose|data|run|table|figures|compare|limit`.
 
 Everything heavy is imported where it is used, so that `--help`, `list` and tab completion answer at once.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -20,8 +21,11 @@ import typer
 from systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
-    from bench.suite import Suite
+    from bench.limit import Design, Limit
+    from bench.suite import Case, Suite
     from methods.method import Fit
+    from systems.lattice import Library, System
+    from systems.samples import Samples
 
 app = typer.Typer(
     name="latticebench",
@@ -35,6 +39,8 @@ app = typer.Typer(
 Kind = Literal["systems", "libraries", "methods", "suites"]
 AnyEnds = Literal["unknown", "free", "fixed", "periodic", "antiperiodic"]
 KnownEnds = Literal["free", "fixed", "periodic", "antiperiodic"]
+# The library of a system that has the terms of its own equation.
+EQUATION = "equation"
 
 
 def main() -> None:
@@ -92,6 +98,12 @@ def _libraries(incomplete: str) -> list[str]:
 
     found = {library.name for name in systems.names() for library in systems.find(name).libraries}
     return sorted(name for name in found if name.startswith(incomplete))
+
+
+def _recordings(incomplete: str) -> list[str]:
+    from bench.recordings import RECORDINGS
+
+    return [one.name for one in RECORDINGS if one.name.startswith(incomplete)]
 
 
 def _suite_files() -> list[Path]:
@@ -195,25 +207,18 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise, gaps and uneven times.")] = 1,
 ) -> None:
     """Simulate a system and write samples of it."""
-    import pydantic
-
     import systems
     from bench.case import samples as make_samples
-    from bench.suite import Case
     from systems.samples import FORMATS, write
 
     found = systems.find(system)
     if out.suffix.lower() not in FORMATS:
         raise unknown("ending", out.suffix, FORMATS, str(out))
-    try:
-        case = Case(
-            system=system, parameters=_numbers(given), sites=sites, samples=samples, span=span, uneven=uneven, noise=noise,
-            missing=missing, trajectories=trajectories, velocities=velocities, ends=ends, initial=initial,
-            integrator=integrator, seed=seed, library="", label="", method="",
-        )  # fmt: skip
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(f"--{first['loc'][0]}: {first['msg'].lower()}, it is {first['input']!r}") from None
+    case = _case(
+        system=system, parameters=_numbers(given), sites=sites, samples=samples, span=span, uneven=uneven, noise=noise,
+        missing=missing, trajectories=trajectories, velocities=velocities, ends=ends, initial=initial,
+        integrator=integrator, seed=seed,
+    )  # fmt: skip
     data = make_samples(case, Path())
     write([one.observed() for one in data], out)
     listed = ", ".join(f"{name}={value:g}" for name, value in found.with_parameters(case.parameters).items())
@@ -248,34 +253,14 @@ def fit(
 ) -> None:
     """Fit the coefficients of a library to recorded samples."""
     import methods
-    import systems
     from bench.screen import show_fit, waiting
     from methods.method import Skipped, make, solve
     from systems.files import write_text
-    from systems.lattice import library as make_library
     from systems.samples import read_all
 
     method = method or methods.DEFAULT
     chosen = make(methods.find(method), _texts(given))
-    known = None if system is None else systems.find(system)
-    if terms is not None and library is not None:
-        raise InputError("--terms and --library: give one of them")
-    if terms is not None:
-        candidates = make_library("terms", terms)
-    elif known is not None:
-        if library is None:
-            raise InputError(
-                f"--library: choose one of {', '.join(one.name for one in known.libraries)}, or give --terms"
-            )
-        candidates = known.library(library)
-    else:
-        raise InputError(
-            'give --system and --library, or --terms and --order, such as --terms "u[n+1]; u[n-1]; u[n]" --order 2'
-        )
-    if order is None:
-        if known is None:
-            raise InputError("--order: 1 for du/dt, 2 for the second derivative")
-        order = known.order
+    _, candidates, order = _asked(system, library, terms, order)
     data = read_all(files, ends)
     try:
         with waiting(f"{method}: fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
@@ -295,6 +280,181 @@ def fit(
     show_fit(found)
     if json_out is not None:
         write_text(Path(json_out), content)
+
+
+@app.command(
+    epilog="Examples:  latticebench diagnose phi4.csv --system phi4 --html diagnosis.html\n\n"
+    '           latticebench diagnose my.csv --terms "u\\[n+1]+u\\[n-1]-2*u\\[n]; sin(u\\[n])" --order 2 --holdout later.csv'
+)
+def diagnose(
+    files: Annotated[list[Path], typer.Argument(help="One or more .csv, .npz or .parquet files.")],
+    system: Annotated[
+        str | None,
+        typer.Option(help="Declare this system's equation, its coefficients free.", autocompletion=_systems),
+    ] = None,
+    terms: Annotated[
+        str | None, typer.Option(help="Declare an equation of your own: its terms, with ; between them.")
+    ] = None,
+    order: Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")] = None,
+    ends: Annotated[
+        AnyEnds | None,
+        typer.Option(help="How the chain ends: the system's own, with --terms unknown, if not given."),
+    ] = None,
+    effects: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A .toml file with effects of your own, tried beside the catalogue."),
+    ] = None,
+    holdout: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Judge forecasts on this file, not on the last 30 % of the record; may be given several times.",
+        ),
+    ] = None,
+    json_out: Annotated[
+        str | None, typer.Option("--json", metavar="OUT", help="Write it as JSON to a file, or - for the screen.")
+    ] = None,
+    html_out: Annotated[
+        Path | None, typer.Option("--html", metavar="OUT", help="Write one HTML file with pictures.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated noise that evidence is judged by.")] = 1,
+) -> None:
+    """Say what a declared equation lacks: find the residual, trace it to an effect, add that, and show the error before and after."""
+    from bench.loop.repair import diagnose as close_the_loop
+    from bench.loop.report import content, show, watching
+    from systems.effects import CATALOGUE, load
+    from systems.files import write_text
+    from systems.samples import read_all
+
+    if (system is None) == (terms is None):
+        raise InputError(
+            'give --system, or --terms and --order, such as --terms "u[n+1]+u[n-1]-2*u[n]; sin(u[n])" --order 2'
+        )
+    known, declared, order = _declared(system, terms, order)
+    catalogue = (*CATALOGUE, *(load(effects) if effects is not None else ()))
+    ends = ends or ("unknown" if known is None else known.ends)
+    data = read_all(files, ends)
+    # Read together, since the two must be of the same chain.
+    later = read_all([*files, *holdout], ends)[len(data) :] if holdout else []
+    try:
+        with watching() as watcher, redirect_stdout(sys.stderr):
+            found = close_the_loop(declared, order, data, catalogue, seed, held_out=later, watcher=watcher)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{data[0].source}: the diagnosis failed: {type(error).__name__}: {error}") from error
+    text = json.dumps(content(found), indent=2, allow_nan=False) + "\n"
+    # Files first: whoever reads the screen may stop reading.
+    if html_out is not None:
+        from bench.loop.page import write_page
+        from bench.provenance import command_line, origin
+
+        write_page(found, {"command": " ".join(["latticebench", *command_line()]), "seed": seed, **origin()}, html_out)
+    if json_out == "-":
+        print(text, end="")
+        return
+    if json_out is not None:
+        write_text(Path(json_out), text)
+    show(found)
+
+
+def _declared(system: str | None, terms: str | None, order: int | None) -> tuple[System | None, Library, int]:
+    """Make out which equation is declared: the system's own terms, or those given."""
+    if system is not None:
+        import systems
+
+        if EQUATION not in [one.name for one in systems.find(system).libraries]:
+            raise InputError(
+                f"--system {system}: it has no library {EQUATION!r} that says which coefficients are free; give it one, or give --terms"
+            )
+    return _asked(system, EQUATION if terms is None else None, terms, order)
+
+
+data_app = typer.Typer(
+    help="List measured recordings, and take a local copy of one.",
+    epilog="Example:  latticebench data take gliders ~/Downloads/gliders.csv",
+    invoke_without_command=True,
+    rich_markup_mode="rich",
+)
+app.add_typer(data_app, name="data")
+
+
+@data_app.callback()
+def data(
+    context: typer.Context,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
+) -> None:
+    """List measured recordings, and take a local copy of one."""
+    if context.invoked_subcommand is not None:
+        return
+    from bench.recordings import RECORDINGS
+
+    rows = [dataclasses.asdict(one) for one in RECORDINGS]
+    if as_json:
+        print(json.dumps(rows, indent=2))
+        return
+    for one in RECORDINGS:
+        print(f"{one.name}: {one.what}")
+        print(f"    {one.rows} rows of {one.columns}, {one.sampling}\n    source:  {one.source}")
+        print(f"    licence: {one.licence}\n    SHA-256: {one.sha256}\n")
+    print("None of them comes with this program. Have one already?  latticebench data take NAME FILE")
+
+
+@data_app.command(epilog="Example:  latticebench data take gliders ~/Downloads/gliders.csv data")
+def take(
+    name: Annotated[str, typer.Argument(help="A recording that `data` lists.", autocompletion=_recordings)],
+    origin: Annotated[Path, typer.Argument(metavar="FILE", help="The file that you have of it.")],
+    place: Annotated[
+        Path | None, typer.Argument(metavar="[TO]", help="A folder or a .csv file for the copy; data/ if not given.")
+    ] = None,
+) -> None:
+    """Check that a file is a recording, by its SHA-256, and copy it to where you want it. Nothing is downloaded."""
+    from bench.recordings import take as copy
+
+    made, new = copy(name, origin, place)
+    print(f"{made}: {'copied' if new else 'was there already'}, SHA-256 as it should be")
+
+
+def _asked(
+    system: str | None, library: str | None, terms: str | None, order: int | None
+) -> tuple[System | None, Library, int]:
+    """Make out which library and order --system, --library, --terms and --order ask for."""
+    import systems
+    from systems.lattice import library as make_library
+
+    known = None if system is None else systems.find(system)
+    if terms is not None and library is not None:
+        raise InputError("--terms and --library: give one of them")
+    if terms is not None:
+        candidates = make_library("terms", terms)
+    elif known is not None:
+        if library is None:
+            raise InputError(
+                f"--library: choose one of {', '.join(one.name for one in known.libraries)}, or give --terms"
+            )
+        candidates = known.library(library)
+    else:
+        raise InputError(
+            'give --system and --library, or --terms and --order, such as --terms "u[n+1]; u[n-1]; u[n]" --order 2'
+        )
+    if order is None:
+        if known is None:
+            raise InputError("--order: 1 for du/dt, 2 for the second derivative")
+        order = known.order
+    return known, candidates, order
+
+
+def _case(**given: Any) -> Case:
+    """Check what describes simulated samples."""
+    import pydantic
+
+    from bench.suite import Case
+
+    try:
+        return Case(**{"library": "", "label": "", "method": "", **given})
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"--{first['loc'][0]}: {first['msg'].lower()}, it is {first['input']!r}") from None
 
 
 def _fit_json(found: Fit) -> dict[str, Any]:
@@ -359,16 +519,20 @@ def table(
     folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
     out: Annotated[Path | None, typer.Option(help="Publish the tables here, as CSV, Markdown and LaTeX.")] = None,
     value: Annotated[str, typer.Option(help="Which score to show.")] = "e2",
+    only: Annotated[
+        list[str] | None, typer.Option(help="Publish this table alone; may be given several times.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
 ) -> None:
     """Show the results of a run as a table, and publish them."""
     from bench.provenance import describe
     from bench.screen import show_results
     from bench.store import open_store
-    from bench.tables import SCORES, publish
+    from bench.tables import SCORES, TABLES, publish
 
     if value not in SCORES:
         raise unknown("score", value, SCORES, "--value")
+    chosen = _some(only, TABLES, "table")
     store = open_store(folder)
     found = store.all()
     if not found:
@@ -378,7 +542,7 @@ def table(
     else:
         show_results(found, describe(found, store.about()), "", value)
     if out is not None:
-        for path in publish(found, describe(found, store.about()), out):
+        for path in publish(found, describe(found, store.about()), out, chosen):
             print(path, file=sys.stderr if as_json else sys.stdout)
 
 
@@ -386,17 +550,21 @@ def table(
 def figures(
     folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
     out: Annotated[Path | None, typer.Option(help="Where to write them; DIR/figures if not given.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Draw this kind of figure alone; may be given several times.")
+    ] = None,
 ) -> None:
     """Draw the results of a run: coefficients against iteration, errors, error against time and noise."""
-    from bench.figures import draw_all
+    from bench.figures import FIGURES, draw_all
     from bench.provenance import describe
     from bench.store import open_store
 
+    chosen = _some(only, FIGURES, "figure")
     store = open_store(folder)
     found = store.all()
     if not found:
         raise InputError(f"{folder}: there are no results in it yet; run a suite with --results {folder}")
-    for path in draw_all(found, describe(found, store.about()), out if out is not None else folder / "figures"):
+    for path in draw_all(found, describe(found, store.about()), out if out is not None else folder / "figures", chosen):
         print(path)
 
 
@@ -431,6 +599,138 @@ def compare(
         raise typer.Exit(1)
 
 
+@app.command(
+    epilog="Examples:  latticebench limit --system phi4 --set C=2 --library lib4 --noise 0.01\n\n"
+    "           latticebench limit phi4.csv --system phi4 --library lib2 --ends free"
+)
+def limit(
+    files: Annotated[
+        list[Path] | None, typer.Argument(help="Recorded samples; without any, samples of --system are taken.")
+    ] = None,
+    system: Annotated[
+        str | None,
+        typer.Option(help="What moves; with files, where order and libraries come from.", autocompletion=_systems),
+    ] = None,
+    library: Annotated[str | None, typer.Option(help="A library of the system.", autocompletion=_libraries)] = None,
+    terms: Annotated[str | None, typer.Option(help="Terms of your own, with ; between them.")] = None,
+    order: Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")] = None,
+    ends: Annotated[
+        AnyEnds | None,
+        typer.Option(
+            help="How the chain ends, as far as the fit knows: the system's own, with files unknown, if not given."
+        ),
+    ] = None,
+    target: Annotated[float, typer.Option(help="Wanted relative error of the coefficients.")] = 0.01,
+    given: Settings = None,
+    sites: Annotated[int | None, typer.Option(help="Number of sites N.")] = None,
+    samples: Annotated[int | None, typer.Option(help="Number of sample times; 50 if not given.")] = None,
+    span: Annotated[float | None, typer.Option(help="Length of the record; 10 if not given.")] = None,
+    noise: Annotated[
+        float | None,
+        typer.Option(help="Noise level: sigma over the RMS of the field about its mean; 0.01 if not given."),
+    ] = None,
+    trajectories: Annotated[int | None, typer.Option(help="Number of trajectories; 1 if not given.")] = None,
+    velocities: Annotated[bool | None, typer.Option(help="Whether velocities are seen (second-order systems).")] = None,
+    initial: Annotated[str | None, typer.Option(help="Initial state; the system's first if not given.")] = None,
+    json_out: Annotated[
+        str | None, typer.Option("--json", metavar="OUT", help="Write it as JSON to a file, or - for the screen.")
+    ] = None,
+) -> None:
+    """Say how well any method could know the coefficients from such samples, and what would be needed for more.
+
+    Options from --set to --initial are about samples of a system; of recorded ones everything is known but their noise, which
+    is taken from a fit.
+    """
+    from bench.limit import denser, design
+    from bench.screen import show_limit, waiting
+    from systems.files import write_text
+
+    known, candidates, order = _asked(system, library, terms, order)
+    only_simulated = {
+        "--set": given, "--sites": sites, "--samples": samples, "--span": span, "--noise": noise,
+        "--trajectories": trajectories, "--velocities": velocities, "--initial": initial,
+    }  # fmt: skip
+    if files:
+        for name, value in only_simulated.items():
+            if value is not None:
+                raise InputError(f"{name}: files are given, whose samples are as they are; leave it out, or the files")
+        from systems.samples import read_all
+
+        data = read_all(files, ends or "unknown")
+        with waiting(f"fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
+            fit = _followed(data, candidates, order)
+
+        def bound_at(more: int, longer: int) -> Limit:
+            if longer > 1:
+                raise InputError("nobody knows how the motion goes on after the record")
+            return denser(data, fit, more)
+
+        note = f"{data[0].source}: bound along the motion that {fit.method!r} fits to the samples, with the noise that it leaves"
+        note += "" if fit.status == "ok" else f" ({fit.status})"
+    else:
+        if known is None or system is None:
+            raise InputError("give one or more files, or --system: the bound is about samples")
+        from bench.case import bound
+
+        case = _case(
+            system=system, parameters=_numbers(given), sites=sites, initial=initial, library=candidates.name,
+            terms=candidates.texts if terms is not None else (), known_ends=ends != "unknown",
+            ends=None if ends == "unknown" else ends,
+            **{
+                name: value for name, value in (
+                    ("samples", samples), ("span", span), ("trajectories", trajectories), ("velocities", velocities),
+                ) if value is not None
+            },
+            noise=0.01 if noise is None else noise,
+        )  # fmt: skip
+
+        def bound_at(more: int, longer: int) -> Limit:
+            changed = {"samples": case.samples * more * longer, "span": case.span * longer}
+            return bound(case.model_copy(update=changed), Path())
+
+        note = f"{case.data}: bound at the truth of the system"
+    with waiting("taking the bound"):
+        found = bound_at(1, 1)
+        needed = design(bound_at, target=target)
+    content = json.dumps(_jsonable(_limit_json(found, needed, note)), indent=2, allow_nan=False) + "\n"
+    if json_out == "-":
+        print(content, end="")
+        return
+    show_limit(found, needed, note)
+    if json_out is not None:
+        write_text(Path(json_out), content)
+
+
+def _followed(data: Sequence[Samples], candidates: Library, order: int) -> Fit:
+    """Fit by the method that gives the motion it follows."""
+    import methods
+    from methods.method import Skipped, solve
+
+    method = next(kind() for kind in methods.registered().values() if kind().abilities.motion)
+    try:
+        return solve(method, data, candidates, order, 1)
+    except Skipped as reason:
+        raise InputError(f"{data[0].source}: {reason}") from None
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{data[0].source}: the fit failed: {type(error).__name__}: {error}") from error
+
+
+def _limit_json(found: Limit, needed: Design, note: str) -> dict[str, Any]:
+    rows = zip(found.library.texts, found.coefficients, found.stderr, found.errors, found.verdicts, strict=True)
+    return {
+        "about": note, "noise": found.noise, "samples": found.samples, "span": found.span,
+        "conditioning": found.conditioning, "relative": found.relative,
+        "terms": {
+            text: {"coefficient": float(value), "stderr": float(stderr), "error": float(error), "verdict": verdict}
+            for text, value, stderr, error, verdict in rows
+        },
+        "groups": [[found.library.texts[k] for k in group] for group in found.groups],
+        "needed": dataclasses.asdict(needed),
+    }  # fmt: skip
+
+
 # Words and numbers ---------------------------------------------------------------------------------------------------------
 
 
@@ -443,6 +743,14 @@ def _texts(given: Sequence[str] | None) -> dict[str, str]:
             raise InputError(f"--set {text!r}: write NAME=VALUE, such as --set threshold=0.1")
         pairs[name.strip()] = value.strip()
     return pairs
+
+
+def _some(only: Sequence[str] | None, names: Sequence[str], kind: str) -> Sequence[str]:
+    """Take all names, or those that --only gives."""
+    for name in only or ():
+        if name not in names:
+            raise unknown(kind, name, names, "--only")
+    return only or names
 
 
 def _numbers(given: Sequence[str] | None) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,30 +21,39 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+FIGURES = ("coefficients", "errors", "error-against-seconds", "error-against-noise", "cost")
 COLOURS = ("tab:blue", "tab:red", "tab:green", "goldenrod", "tab:purple", "tab:cyan", "tab:brown", "tab:pink")
 MARKERS = "os^Dv<>Ph*Xp"
 # Errors of round-off size share the lowest place of an axis.
 LOWEST = 1e-12
+# An equation that is ten times off is as wrong as any.
+HIGHEST = 10.0
 # A library as large as the paper's largest fits beside an axis.
 MOST_NAMES = 14
 
 
-def draw_all(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Draw every figure that the results allow, and give the files.
+def draw_all(
+    results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = FIGURES
+) -> list[Path]:
+    """Draw every figure that the results allow, or those of some kinds, and give the files.
 
     Raises:
         InputError: a file cannot be written.
     """
     written = []
-    for name, group in panels(results).items():
-        written.append(_save(panel(group), folder / f"coefficients-{name}.png", about))
+    if "coefficients" in only:
+        for name, group in panels(results).items():
+            written.append(_save(panel(group), folder / f"coefficients-{name}.png", about))
     table = cases(results)
     if table["e2"].notna().any():
-        written.append(_save(errors(table), folder / "errors.png", about))
-        written.append(_save(error_against_seconds(table), folder / "error-against-seconds.png", about))
+        drawn: dict[str, Callable[[pd.DataFrame], Figure]] = {
+            "errors": errors, "error-against-seconds": error_against_seconds
+        }  # fmt: skip
         if not _by_noise(table[table["e2"].notna()]).empty:
-            written.append(_save(error_against_noise(table), folder / "error-against-noise.png", about))
-            written.append(_save(cost(table), folder / "cost.png", about))
+            drawn |= {"error-against-noise": error_against_noise, "cost": cost}
+        for name, draw in drawn.items():
+            if name in only:
+                written.append(_save(draw(table), folder / f"{name}.png", about))
     return written
 
 
@@ -216,35 +225,76 @@ def _by_noise(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def error_against_noise(table: pd.DataFrame) -> Figure:
-    """Draw the median E2 against the noise level, one line a method, one panel for system and library."""
+    """Draw E2 against the noise level, one line a method, one panel for system and library.
+
+    A line is the median over the seeds, the bar at it holds their middle 80 %, and the dashed line is the Cramer-Rao bound.
+    With two noise levels or more, the noise-free cases are left to the tables: their errors are of another order.
+    """
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullLocator
 
     known = _by_noise(table[table["e2"].notna() | ~table["status"].isin(["ok", "skipped"])]).copy()
     known.loc[known["e2"].isna(), "e2"] = np.inf
+    noisy = known[known["noise"] > 0]
+    alone = noisy["noise"].nunique() < 2
+    if not alone:
+        known = noisy
     panels = list(dict.fromkeys(zip(known["system"], known["library"], strict=True)))
-    across = min(len(panels), 3)
+    across = 4 if len(panels) % 4 == 0 else min(len(panels), 3)
     down = -(-len(panels) // across)
-    figure, grid = plt.subplots(down, across, figsize=(4.2 * across, 3.4 * down), squeeze=False, layout="constrained")
+    figure, grid = plt.subplots(
+        down, across, figsize=(3.4 * across + 1.6, 3.3 * down), squeeze=False, layout="constrained", sharex=True, sharey=True
+    )  # fmt: skip
     methods = list(dict.fromkeys(known["method"]))
-    smallest = known.loc[known["noise"] > 0, "noise"].min()
+    lines: dict[str, Any] = {}
     for axes, (system, library) in zip(grid.flat, panels, strict=False):
+        here = known[(known["system"] == system) & (known["library"] == library)]
         for k, method in enumerate(methods):
-            chosen = known[(known["system"] == system) & (known["library"] == library) & (known["method"] == method)]
-            median = chosen.groupby("noise")["e2"].median()
-            axes.plot(
-                median.index, _bounded(median), f"-{MARKERS[k % len(MARKERS)]}", color=f"C{k % 10}", label=method, ms=4
-            )
-        axes.set_xscale("symlog", linthresh=smallest)
+            by_noise = here[here["method"] == method].groupby("noise")["e2"]
+            low, middle, high = (by_noise.quantile(share, interpolation="nearest") for share in (0.1, 0.5, 0.9))
+            if middle.empty:
+                continue
+            # A little beside each other, since the best methods lie on one line.
+            at = middle.index * (1.0 if alone else 10 ** (0.014 * (k - (len(methods) - 1) / 2)))
+            colour = f"C{k % 10}"
+            axes.vlines(at, _bounded(low), np.minimum(high, HIGHEST), color=colour, alpha=0.35, lw=2.2)
+            style = f"-{MARKERS[k % len(MARKERS)]}"
+            (line,) = axes.plot(at, _bounded(middle), style, color=colour, label=method, ms=3.5, lw=0.9)
+            lines.setdefault(method, line)
+        floor = here.groupby("noise")["bound"].max().dropna()
+        if len(floor) > 1:
+            (line,) = axes.plot(floor.index, floor, "--", color="black", lw=1.5, zorder=5, label="Cramer-Rao bound")
+            lines.setdefault("bound", line)
+        if alone:
+            axes.set_xscale("symlog", linthresh=noisy["noise"].min())
+        else:
+            axes.set_xscale("log")
+            levels = sorted(known["noise"].unique())
+            axes.set_xticks(levels, [f"{100 * level:g} %" for level in levels])
+            axes.xaxis.set_minor_locator(NullLocator())
         axes.set_yscale("log")
-        axes.set_title(f"{system}, {library}", fontsize=8)
+        axes.set_title(f"{system}, {library}".replace(_shared([one for one, _ in panels]), ""), fontsize=9)
         axes.grid(alpha=0.25)
+    seen = known["e2"].replace(np.inf, np.nan)
+    least = min(
+        seen.groupby([known["system"], known["library"], known["method"], known["noise"]]).median().min(), HIGHEST
+    )
+    grid[0][0].set_ylim(max(min(least, known["bound"].min()) / 2 if not alone else least / 2, LOWEST / 2), HIGHEST)
     for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
-    figure.supxlabel("noise level", fontsize=9)
-    figure.supylabel("E2 (median over seeds)", fontsize=9)
-    handles, names = grid[0][0].get_legend_handles_labels()
-    figure.legend(handles, names, fontsize=8, loc="outside right center", frameon=False)
+    figure.supxlabel("noise level: sigma over the RMS of the field", fontsize=9)
+    figure.supylabel("E2 (median over seeds, with the middle 80 %)", fontsize=9)
+    figure.legend(handles=list(lines.values()), fontsize=8, loc="outside right center", frameon=False)
     return figure
+
+
+def _shared(texts: Sequence[str]) -> str:
+    """Give the words that all texts end with, which a title need not repeat."""
+    words = [text.split() for text in texts]
+    count = 0
+    while all(len(one) > count + 1 and one[-1 - count] == words[0][-1 - count] for one in words):
+        count += 1
+    return " " + " ".join(words[0][len(words[0]) - count :]) if count else ""
 
 
 def _bounded(values: pd.Series) -> np.ndarray:

@@ -6,14 +6,17 @@ initial state and, at unknown ends, the splines that the sites without an equati
 Statistics (1946), section 32.3; Rao, Bull. Calcutta Math. Soc. 37, 81 (1945)). The derivatives come from the variational
 equations (`systems.sensitivity`). The bound scales with the noise.
 
+Values that were not observed (NaN in the data) carry no weight. A measured input counts as known; between its samples it is
+their cubic spline.
+
 Unknown ends: the bound takes one B-spline coefficient a sample and site for the unknown motion there, as free as the samples
 allow; the bound for known ends is lower.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,16 +25,21 @@ from systems.errors import InputError
 from systems.lattice import Ends, Library, System
 from systems.samples import Samples, SimulatedSamples
 from systems.sensitivity import Drive, Dynamics, Stretches, condense, split_parts
-from systems.simulate import noise_size, sample_times, simulate
+from systems.simulate import noise_size, simulate
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-# A coefficient or a sum counts as known below this relative error.
+    from methods.method import Fit
+
+# A coefficient or a sum counts as known below this relative error, and as roughly known while it can be told from 0.
 KNOWN = 0.1
+ROUGH = 0.5
 # Estimates correlated more than this are told as a group.
 TOGETHER = 0.9
+# Larger groups are counted instead of listed in a verdict.
+LISTED = 4
 DEGREE = 5
 
 
@@ -71,9 +79,10 @@ class Limit:
 
     @property
     def errors(self) -> Float[ndarray, " terms"]:
-        """Each standard error over its coefficient; for a coefficient of 0, over what would make it the whole derivative."""
-        reference = np.where(self.coefficients != 0, np.abs(self.coefficients), 1 / self.scales)
-        return self.stderr / reference
+        """Each standard error over its coefficient; where that cannot be told from 0, over what would be the whole derivative."""
+        with np.errstate(divide="ignore"):
+            relative = self.stderr / np.abs(self.coefficients)
+        return np.asarray(np.where(relative <= ROUGH, relative, self.stderr * self.scales))
 
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
@@ -112,29 +121,32 @@ class Limit:
     @property
     def verdicts(self) -> tuple[str, ...]:
         """One sentence a term."""
-        texts = []
         member = {term: group for group in self.groups for term in group}
-        for k, error in enumerate(self.errors):
-            if error <= KNOWN:
-                ending = "" if self.coefficients[k] != 0 else " of the derivative (its coefficient is 0)"
-                texts.append(f"known to {100 * error:.2g} %{ending}")
-            elif k in member:
-                texts.append(self._sum(member[k]))
-            else:
-                texts.append("cannot be known from these samples")
-        return tuple(texts)
+        return tuple(
+            (self._sum(member[k]) if error > KNOWN and k in member else "") or self._alone(k, float(error))
+            for k, error in enumerate(self.errors)
+        )
+
+    def _alone(self, k: int, error: float) -> str:
+        """Judge a coefficient by itself."""
+        if error > ROUGH:
+            return "cannot be known from these samples"
+        value = abs(float(self.coefficients[k]))
+        what = "" if self.stderr[k] <= ROUGH * value else " of the derivative, and cannot be told from 0"
+        what = what if value else " of the derivative (its coefficient is 0)"
+        return f"known {'only ' if error > KNOWN else ''}to {100 * error:.2g} %{what}"
 
     def _sum(self, group: Sequence[int]) -> str:
+        """Say which sum of a group's coefficients is known; empty where none is."""
         weights, value, error = self.combination(group)
         reference = abs(value)
         largest = int(np.argmax(np.abs(weights)))
         least = 1 / self.scales[list(group)][largest]
         share = error / reference if reference > 1e-9 * least else error / least
         if share > KNOWN:
-            return "cannot be known from these samples"
-        if len(group) > 4:
-            listed = ", ".join(self.library.texts[k] for k in group)
-            return f"only weighted sums of the coefficients of {listed} are known, the best to {100 * share:.2g} %"
+            return ""
+        if len(group) > LISTED:
+            return f"only weighted sums with {len(group) - 1} other terms are known, the best to {100 * share:.2g} %"
         parts = []
         for weight, k in zip(weights, group, strict=True):
             if abs(weight) < 0.01:
@@ -169,6 +181,7 @@ class Design:
         noise: the largest noise level that allows it.
         samples: the fewest samples within the same time, or None where more than were tried are needed.
         span: the shortest record with the same time between samples, or None likewise.
+        records: the fewest records like this one, each with noise of its own.
     """
 
     target: float
@@ -176,6 +189,7 @@ class Design:
     noise: float
     samples: int | None
     span: float | None
+    records: int
 
 
 def bound(
@@ -210,65 +224,102 @@ def bound(
     Raises:
         InputError: something is unsound, or the equation is outside the library.
     """
+    chain: Ends = (ends or system.ends) if known_ends else "unknown"
     data = [
-        simulate(system, parameters=parameters, sites=sites, times=times, ends=ends, initial=initial, variation=draw)
+        simulate(
+            system, parameters=parameters, sites=sites, times=times, ends=ends, initial=initial, variation=draw,
+            velocities=velocities,
+        )
         for draw in variations
-    ]
-    truth = system.truth(library, parameters or {})
+    ]  # fmt: skip
+    return bound_of([replace(one, ends=chain) for one in data], library, system.order, noise=noise)
+
+
+def bound_of(data: Sequence[SimulatedSamples], library: Library, order: int, *, noise: float) -> Limit:
+    """Give the bound for simulated samples, at their truth.
+
+    Args:
+        data: what was observed; v counts where it is there, values that are NaN do not.
+        library: whose coefficients are wanted.
+        order: of the time derivative.
+        noise: sigma over the RMS of each field about its mean, whatever noise the samples have.
+
+    Raises:
+        InputError: the equation is outside the library, or the noise level is no positive number.
+    """
+    truth = data[0].truth(library)
     if truth is None:
         raise InputError(
-            f"the equation of {system.name!r} is outside the library {library.name!r}: there are no coefficients to bound"
+            f"the equation of {data[0].source} is outside the library {library.name!r}: there are no coefficients to bound"
         )
-    chain: Ends = (ends or system.ends) if known_ends else "unknown"
-    return bound_along(data, library, system.order, truth, ends=chain, velocities=velocities, noise=noise)
+    motion = [one.exact for one in data if one.exact is not None]
+    return bound_along(data, motion, library, order, truth, noise=noise)
+
+
+def bound_of_fit(data: Sequence[Samples], fit: Fit) -> Limit:
+    """Give the bound for measured samples, at a fit of them: along its motion, with its coefficients and its noise.
+
+    The noise is what the fit leaves, errors of the model included.
+
+    Raises:
+        InputError: the fit follows no motion.
+    """
+    if fit.motion is None:
+        raise InputError(
+            f"{data[0].source}: method {fit.method!r} follows no motion, along which a bound could be taken"
+        )
+    sizes = [float(fit.found[name]) for name in ("noise_u", "noise_v") if name in fit.found]
+    return bound_along(data, fit.motion, fit.library, fit.order, fit.coefficients, sizes=sizes)
 
 
 def bound_along(
     data: Sequence[Samples],
+    motion: Sequence[Samples],
     library: Library,
     order: int,
     coefficients: Float[ndarray, " terms"],
     *,
-    ends: Ends | None = None,
-    velocities: bool = True,
     noise: float = 0.01,
+    sizes: Sequence[float] | None = None,
 ) -> Limit:
     """Give the bound along trajectories whose exact states are known (simulated or fitted).
 
     Args:
-        data: states at the sample times; for simulated samples their `exact` ones are taken.
+        data: what was observed: v counts where it is there, values that are NaN do not; with how the chains end.
+        motion: the states at the same times; v is needed for order 2.
         library: the terms.
         order: of the time derivative.
-        coefficients: of the equation that the data follow.
-        ends: as the samples say when None.
-        velocities: whether v is seen too.
+        coefficients: of the equation that the motion follows.
         noise: sigma over the RMS of each field about its mean.
+        sizes: standard deviation of the noise on each real part of u, and of v, in place of `noise`.
 
     Raises:
-        InputError: the noise level is no positive number, or v is not known.
+        InputError: the noise is no positive number, v is not known, or an input is missing.
     """
-    if not (np.isfinite(noise) and noise > 0):
+    if sizes is None and not (np.isfinite(noise) and noise > 0):
         raise InputError(f"noise: {noise!r} must be a number above 0 (0.01 for one per cent)")
-    rows, designs, rates = [], [], []
-    for one in data:
-        exact = one.exact if isinstance(one, SimulatedSamples) and one.exact is not None else one
+    rows, designs, rates, levels = [], [], [], []
+    for one, exact in zip(data, motion, strict=True):
         if order == 2 and exact.v is None:
             raise InputError(f"{one.source}: the bound needs the velocities of the exact motion")
-        chain = ends or one.ends
-        dynamics = Dynamics(library.terms, order, exact.is_complex, exact.sites, chain)
+        dynamics = Dynamics(library.terms, order, exact.is_complex, exact.sites, one.ends)
         drive, splines = _drive(exact, dynamics)
-        stretches = Stretches(dynamics, exact.t[:-1], exact.t[1:], drive=drive)
+        force = one.forcing() if library.uses("f") else None
+        stretches = Stretches(dynamics, exact.t[:-1], exact.t[1:], force, drive)
         nodes = dynamics.pack(exact.u, exact.v)
         # Per real part; a complex field shares its noise between both.
-        sizes = [noise_size(exact.u, noise) / np.sqrt(dynamics.parts)]
-        if order == 2:
-            assert exact.v is not None
-            sizes.append(noise_size(exact.v, noise) if velocities else np.inf)
-        if not all(size > 0 for size in sizes):
-            raise InputError(f"{one.source}: nothing moves, so that a noise level has no meaning")
-        weight = np.broadcast_to(
-            (1 / np.asarray(sizes))[:, None, None], (len(exact.t), order, dynamics.parts, dynamics.sites)
-        )
+        share = np.sqrt(dynamics.parts)
+        weight = np.zeros((len(exact.t), order, dynamics.parts, dynamics.sites))
+        for level, (states, seen) in enumerate([(exact.u, one.u), (exact.v, one.v)][:order]):
+            if seen is None:
+                continue
+            assert states is not None
+            size = noise_size(states, noise) / share if sizes is None else sizes[level]
+            if not (np.isfinite(size) and size > 0 and noise_size(states, 1.0) > 0):
+                raise InputError(f"{one.source}: nothing moves, or nothing is left to noise: there is no bound")
+            weight[:, level] = (np.isfinite(seen) / size)[:, None]
+            if level == 0:
+                levels.append(size * share / noise_size(states, 1.0))
         accuracy = 1e-6 * float(np.max(np.abs(nodes)))
         steps = stretches.substeps(coefficients, nodes[:-1], accuracy, splines)
         found = condense(
@@ -278,7 +329,8 @@ def bound_along(
         )  # fmt: skip
         rows.append(found.rows)
         driven = stretches.driven(exact.t, splines)
-        rate, values, _ = dynamics.linear(coefficients, exact.t, nodes, None, driven, derivatives=False)
+        f = None if force is None else force(exact.t)
+        rate, values, _ = dynamics.linear(coefficients, exact.t, nodes, f, driven, derivatives=False)
         designs.append(np.moveaxis(values, 1, -1).reshape(-1, len(library.terms)))
         rates.append(rate.reshape(len(rate), order, -1)[:, -1].ravel())
     design = np.concatenate(designs)
@@ -288,7 +340,7 @@ def bound_along(
     height = np.linalg.norm(np.concatenate(rates))
     return Limit(
         library, np.asarray(coefficients, dtype=float), _inverse(np.concatenate(rows)), columns / max(height, 1e-300),
-        float(values[0] / max(values[-1], 1e-300)), noise, sum(len(one.t) for one in data),
+        float(values[0] / max(values[-1], 1e-300)), float(np.mean(levels)), sum(len(one.t) for one in data),
         max(float(one.t[-1] - one.t[0]) for one in data),
     )  # fmt: skip
 
@@ -314,45 +366,32 @@ def _inverse(rows: ndarray) -> ndarray:
     return np.asarray((right.T * spread**2) @ right / scale / scale[:, None])
 
 
-def design(
-    system: System,
-    library: Library,
-    *,
-    target: float = 0.01,
-    times: Float[ndarray, " time"] | None = None,
-    velocities: bool = True,
-    noise: float = 0.01,
-    parameters: Mapping[str, float] | None = None,
-    sites: int | None = None,
-    doublings: int = 4,
-) -> Design:
-    """Say what would be needed to know the coefficients to `target`: less noise, more samples, or a longer record.
+def design(bound_at: Callable[[int, int], Limit], *, target: float = 0.01, doublings: int = 4) -> Design:
+    """Say what would be needed to know the coefficients to `target`: less noise, more samples, or more of a record.
 
     Samples and record are doubled at most `doublings` times; between two doublings log E2 is taken as linear in their log.
+
+    Args:
+        bound_at: gives the bound for so many times as many samples in the same time, and for a record so many times as long;
+            where it cannot, it raises InputError, and the answer is not known.
+        target: the wanted E2.
+        doublings: at most so many.
 
     Raises:
         InputError: as for `bound`, or the target is not a positive number.
     """
     if not (np.isfinite(target) and target > 0):
         raise InputError(f"target: {target!r} must be a number above 0 (0.01 for one per cent)")
-    times = sample_times() if times is None else times
-    step = float(np.mean(np.diff(times)))
-    count = len(times)
+    limit = bound_at(1, 1)
+    now = limit.relative
 
-    def error(at: ndarray) -> float:
-        return bound(
-            system, library, parameters=parameters, sites=sites, times=at, velocities=velocities, noise=noise
-        ).relative
-
-    now = error(times)
-
-    def needed(make: Sequence[ndarray]) -> float | None:
+    def needed(at: Callable[[int], Limit]) -> float | None:
         before = now
         if before <= target:
             return 1.0
-        for k, at in enumerate(make):
+        for k in range(doublings):
             try:
-                after = error(at)
+                after = at(2 ** (k + 1)).relative
             except InputError:
                 return None
             if after <= target:
@@ -360,12 +399,39 @@ def design(
             before = after
         return None
 
-    begin, end = float(times[0]), float(times[-1])
-    denser = [np.linspace(begin, end, (count - 1) * 2**k + 1) for k in range(1, doublings + 1)]
-    longer = [begin + step * np.arange((count - 1) * 2**k + 1) for k in range(1, doublings + 1)]
-    more, further = needed(denser), needed(longer)
+    denser, longer = needed(lambda times: bound_at(times, 1)), needed(lambda times: bound_at(1, times))
     return Design(
-        target, now, noise * target / now,
-        None if more is None else int(np.ceil(1 + (count - 1) * more)),
-        None if further is None else (end - begin) * further,
+        target, now, limit.noise * target / now,
+        None if denser is None else int(np.ceil(limit.samples * denser)),
+        None if longer is None else limit.span * longer,
+        int(np.ceil((now / target) ** 2)),
     )  # fmt: skip
+
+
+def denser(data: Sequence[Samples], fit: Fit, times: int) -> Limit:
+    """Give the bound of `bound_of_fit` if there had been `times` as many samples of the same motion in the same time.
+
+    Between the sample times the fitted motion is taken as its spline of degree 5; nothing is missing there.
+
+    Raises:
+        InputError: as for `bound_of_fit`, or there are too few samples for a spline.
+    """
+    if times == 1 or fit.motion is None:
+        return bound_of_fit(data, fit)
+    seen, motion = [], []
+    for one, exact in zip(data, fit.motion, strict=True):
+        t = np.interp(np.arange((len(one.t) - 1) * times + 1) / times, np.arange(len(one.t)), one.t)
+        u, v = _between(exact.t, exact.u, t), None if exact.v is None else _between(exact.t, exact.v, t)
+        f = None if one.f is None else one.forcing()(t)
+        motion.append(replace(exact, t=t, u=u, v=v, f=f))
+        seen.append(replace(motion[-1], v=None if one.v is None else v))
+    return bound_of_fit(seen, replace(fit, motion=tuple(motion)))
+
+
+def _between(t: ndarray, field: ndarray, at: ndarray) -> ndarray:
+    """Interpolate a motion in time."""
+    from scipy.interpolate import make_interp_spline
+
+    if len(t) <= DEGREE:
+        raise InputError(f"a motion of {len(t)} samples cannot be interpolated; at least {DEGREE + 1} are needed")
+    return np.asarray(make_interp_spline(t, field, k=DEGREE)(at))

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
+    from bench.limit import Design, Limit
     from bench.suite import Case
     from methods.method import Fit
 
@@ -63,6 +64,33 @@ def show_fit(fit: Fit) -> None:
         else f"; {100 * fit.residual:.3g} % of the derivative is left, its noise included"
     )
     for line in (written(fit), f"{fit.method}: {fit.status}{left}; {fit.seconds:.2f} s"):
+        console().print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def show_limit(limit: Limit, design: Design, note: str) -> None:
+    """Print a bound: every coefficient with its smallest error and a verdict, and what more accuracy would need."""
+    columns = ["term", "coefficient", "smallest error", "verdict"]
+    rows = zip(limit.library.texts, limit.coefficients, limit.stderr, limit.verdicts, strict=True)
+    show_rows(columns, [[text, f"{value:.6g}", f"{error:.2g}", verdict] for text, value, error, verdict in rows])
+    wanted = f"{100 * design.target:.3g} %"
+    for group in limit.groups:
+        listed = "; ".join(limit.library.texts[k] for k in group)
+        console().print(f"Hard to tell apart: {listed}", highlight=False, markup=False, soft_wrap=True)
+    state = (
+        f"{note}\n{limit.samples} samples, noise level {limit.noise:.3g}; the terms' conditioning is {limit.conditioning:.2g}\n"
+        f"All coefficients together can be known to {100 * limit.relative:.2g} % (root-mean-square of E2)."
+    )
+    if design.relative <= design.target:
+        text = f"{wanted} is within reach as things are, up to a noise level of {design.noise:.2g}."
+    else:
+        options = [f"a noise level of {design.noise:.2g}"]
+        if design.samples is not None:
+            options.append(f"{design.samples} samples in the same time")
+        if design.span is not None:
+            options.append(f"a record of length {design.span:.3g} with as many samples a time")
+        options.append(f"{design.records} records like this one")
+        text = f"{wanted} would need {', or '.join(options)}."
+    for line in (state, text):
         console().print(line, highlight=False, markup=False, soft_wrap=True)
 
 

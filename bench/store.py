@@ -22,7 +22,7 @@ from bench.suite import Case
 from systems.errors import InputError
 from systems.files import write_text
 
-VERSION = 1
+VERSION = 2
 RESULT = blank(Case.model_construct()).keys() | {"made"}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,14 @@ from systems.files import write_text
 from systems.terms import Term
 
 SCORES = (
-    "e2", "einf", "spurious", "tpr", "forecast_error", "forecast_horizon", "residual", "conditioning",
+    "e2", "einf", "spurious", "tpr", "bound", "forecast_error", "forecast_horizon", "residual", "conditioning",
     "seconds", "cpu_seconds", "peak_mib",
 )  # fmt: skip
 FORMATS = ("csv", "md", "tex")
+# Over fewer seeds a root-mean-square error says little.
+FEW = 3
+TABLES = ("cases", "coefficients", "limits", "summary", "errors")
+MOST_READ = 1000
 # What a row of the matrix is about; a column of it is a method.
 ABOUT = ["part", "data", "library"]
 
@@ -59,29 +63,54 @@ def cases(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def coefficients(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Make the table of coefficients: one row each, with truth and error where there are any."""
+    """Make the table of coefficients: one row each, with truth and error where there are any.
+
+    `bound` is the smallest standard error that an unbiased method can have on these samples, `verdict` what follows from it.
+    """
     rows = []
     for result in results:
         case = Case.model_validate(result["case"])
         for term, value in (result["coefficients"] or {}).items():
             truth = np.nan if result["truth"] is None else result["truth"][term]
-            stderr = np.nan if result["stderr"] is None else _number(result["stderr"][term])
+            stderr, bound = (
+                np.nan if result[name] is None else _number(result[name][term]) for name in ("stderr", "bounds")
+            )
             rows.append(
                 {
                     "part": case.part, "data": case.data, "library": case.library, "method": case.label,
                     "noise": case.noise, "seed": case.seed, "term": term, "coefficient": value, "truth": truth, "error": value - truth,
-                    "stderr": stderr,
+                    "stderr": stderr, "bound": bound, "verdict": (result["verdicts"] or {}).get(term, ""),
                 }
             )  # fmt: skip
-    columns = ["part", "data", "library", "method", "noise", "seed", "term", "coefficient", "truth", "error", "stderr"]
+    columns = [
+        "part", "data", "library", "method", "noise", "seed", "term", "coefficient", "truth", "error", "stderr", "bound", "verdict",
+    ]  # fmt: skip
     return pd.DataFrame(rows, columns=columns)
+
+
+def limits(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Make the table of what can be known: one row for each term of the data and libraries that have a bound.
+
+    `bound` is the smallest standard error of an unbiased method, in units of the coefficient.
+    """
+    rows: dict[tuple[str, ...], dict[str, Any]] = {}
+    for result in results:
+        case = Case.model_validate(result["case"])
+        for term, verdict in (result["verdicts"] or {}).items():
+            # Where the bound depends on the seed, the first one stands for all.
+            about = {"part": case.part, "data": case.data, "library": case.library, "term": term}
+            found = {"truth": result["truth"][term], "bound": _number(result["bounds"][term]), "verdict": verdict}
+            rows.setdefault(tuple(about.values()), {**about, **found})
+    return pd.DataFrame(list(rows.values()), columns=[*ABOUT, "term", "truth", "bound", "verdict"])
 
 
 def summary(table: pd.DataFrame) -> pd.DataFrame:
     """Sum the table of cases up over seeds: one row for data, library and method.
 
     A case that failed or ran out of time counts as an infinite error and stays in the median; one that was skipped leaves no
-    figure. `ok` counts the cases that ended with a fit.
+    figure. `ok` counts the cases that ended with a fit. `efficiency` is the Cramer-Rao bound over the root-mean-square of E2
+    over the seeds: 1 is the best that an unbiased method can do, a failure makes it 0, and with fewer than FEW seeds it is left
+    out. A biased method may pass 1 where the samples say little: 0 for every coefficient is never more than 100 % off.
     """
     if table.empty:
         return pd.DataFrame(columns=[*ABOUT, "method"])
@@ -94,13 +123,25 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     counted.loc[missed, ["tpr", "forecast_horizon"]] = 0.0
     grouped = counted.groupby([*ABOUT, "method"], sort=False)
     found = grouped[[*SCORES]].median()
+    found["efficiency"] = grouped[["bound", "e2"]].apply(_efficiency)
     found.insert(0, "ok", grouped["status"].agg(lambda s: f"{int((s == 'ok').sum())}/{len(s)}"))
     keys = pd.MultiIndex.from_frame(counted[[*ABOUT, "method"]].drop_duplicates())
     return found.reindex(keys).reset_index()
 
 
+def _efficiency(group: pd.DataFrame) -> float:
+    """Divide the bound by the root-mean-square of E2 over the seeds; a case that failed has no bound of its own."""
+    e2, bound = group["e2"].dropna(), group["bound"].dropna()
+    if len(e2) < FEW or bound.empty or not np.any(e2 > 0):
+        return np.nan
+    return float(np.sqrt(np.mean(bound**2) / np.mean(e2**2)))
+
+
 def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
-    """Arrange the summary as part, data and library against method; a cell without a figure says why."""
+    """Arrange the summary as part, data and library against method; a cell without a figure says why.
+
+    Beside errors stands their bound, where there is one.
+    """
     short = summary(table)
     if short.empty:
         return pd.DataFrame(columns=ABOUT)
@@ -119,6 +160,9 @@ def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
     rows = pd.MultiIndex.from_frame(short[ABOUT].drop_duplicates())
     wide = wide.reindex(index=rows, columns=list(dict.fromkeys(short["method"]))).fillna("").reset_index()
     wide.columns.name = None
+    if value == "e2" and short["bound"].notna().any():
+        floors = short.groupby(ABOUT, sort=False)["bound"].max()
+        wide["bound"] = [format_number(floors[tuple(row)]) for row in wide[ABOUT].itertuples(index=False)]
     return _without_empty(wide)
 
 
@@ -138,22 +182,30 @@ def format_number(value: Any) -> str:
     return f"{value:.2g}" if 1e-3 <= abs(value) < 1e4 or value == 0 else f"{value:.1e}"
 
 
-def publish(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Write the tables of cases, coefficients and errors, each as CSV, Markdown and LaTeX with its provenance.
+def publish(
+    results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = TABLES
+) -> list[Path]:
+    """Write the tables, each as CSV, Markdown and LaTeX with its provenance.
+
+    A table without rows is left out; one of more than MOST_READ rows is for programs, and written as CSV alone.
 
     Raises:
         InputError: a file cannot be written.
     """
     table = cases(results)
-    shown = {
-        "cases": table,
-        "coefficients": coefficients(results),
-        "summary": summary(table),
-        "errors": matrix(table),
+    made: dict[str, Callable[[], pd.DataFrame]] = {
+        "cases": lambda: table,
+        "coefficients": lambda: coefficients(results),
+        "limits": lambda: limits(results),
+        "summary": lambda: summary(table),
+        "errors": lambda: matrix(table),
     }
     written = []
-    for name, frame in shown.items():
-        for form in FORMATS:
+    for name in only:
+        frame = made[name]()
+        for form in FORMATS if len(frame) <= MOST_READ else FORMATS[:1]:
+            if frame.empty:
+                continue
             path = folder / f"{name}.{form}"
             write_text(path, render(frame, about, form))
             written.append(path)

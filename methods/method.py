@@ -41,6 +41,7 @@ class Abilities:
         uneven: times that are not evenly spaced.
         missing: values that are NaN.
         truth: it must be shown the truth (a ceiling, not a contestant).
+        motion: its fits hold the motion that they follow, and the noise beside it.
         loads: packages that a fit imports; they are loaded before its clock starts.
     """
 
@@ -49,6 +50,7 @@ class Abilities:
     uneven: bool = True
     missing: bool = False
     truth: bool = False
+    motion: bool = False
     loads: tuple[str, ...] = ()
 
 
@@ -89,6 +91,8 @@ class Fit:
         seconds, cpu_seconds: wall and processor time of the fit alone.
         history: the way there, where there was one.
         found: what the method found on its way (a threshold, a weight), by name.
+        motion: u and, for order 2, v of the fitted motion at the times of each trajectory, where the method follows one; the
+            noise that it leaves is then in `found`: noise_u and, where v was seen, noise_v, standard deviations of each real part.
 
     Raises:
         ValueError: the coefficients do not match the library.
@@ -105,6 +109,7 @@ class Fit:
     cpu_seconds: float = float("nan")
     history: History | None = None
     found: Mapping[str, float | str] = field(default_factory=dict)
+    motion: tuple[Samples, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check that there is one coefficient a term."""

@@ -647,7 +647,7 @@ def arrays(device: str) -> tuple[Any, Callable[..., Any]]:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Keep the linear algebra in one thread, which is fastest at these sizes and gives the same digits each time."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+    from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1):
         yield

@@ -6,8 +6,8 @@ the linearised problem, condensed to the start of each trajectory and the coeffi
 (1981); see `systems.sensitivity`). The states start from the smoothed samples, so that a poor first guess of the coefficients
 does no harm: no trajectory is followed for longer than from one sample to the next.
 
-- Start: a smoothing spline's values and slopes for the states, least squares on the motion from sample to sample for the
-  coefficients.
+- Start: a smoothing spline's values and slopes for the states, the weak form's coefficients (`methods.weak`); where that leads
+  nowhere, least squares on the motion from sample to sample, led on by fits to short pieces.
 - Noise: the standard deviations of u and v are estimated from what the fit leaves, and weigh the two in the next step.
 - Unknown ends: the sites whose stencil is not whole have no equation. Their motion is a B-spline in time of unknown
   coefficients, fitted together with everything else to their own samples; how many B-splines is decided before the fit, by
@@ -20,6 +20,7 @@ does no harm: no trajectory is followed for longer than from one sample to the n
 
 from __future__ import annotations
 
+import functools
 import itertools
 import time
 from collections.abc import Sequence
@@ -30,10 +31,11 @@ import numpy as np
 
 from methods.derivatives import DEGREE, differentiate
 from methods.method import Abilities, Fit, History
+from methods.weak import LOADS, Weak
 from systems.errors import InputError
 from systems.lattice import Library
 from systems.samples import Samples
-from systems.sensitivity import Condensed, Drive, Dynamics, Stretches, condense, split_parts
+from systems.sensitivity import Condensed, Drive, Dynamics, Factor, Stretches, condense, split_parts
 from systems.terms import Term
 
 if TYPE_CHECKING:
@@ -111,25 +113,34 @@ class Solution:
         return float(sum(parts) + self.parameters * np.log(np.sum(self.counts)))
 
 
-def prepare(samples: Samples, terms: tuple[Term, ...], order: int, weights: ndarray | None = None) -> Record:
+def prepare(
+    samples: Samples,
+    terms: tuple[Term, ...],
+    order: int,
+    weights: ndarray | None = None,
+    factors: tuple[Factor | None, ...] | None = None,
+    least_reach: tuple[int, int] = (0, 0),
+) -> Record:
     """Set the equation up on a trajectory's chain.
 
     Args:
         samples: what was observed.
         terms: of the equation.
         order: of the time derivative.
-        weights: of the terms at the sites (terms, N), see `systems.sensitivity.Dynamics`.
+        weights: of each term at each site (terms, N), see `systems.sensitivity.Dynamics`.
+        factors: of the terms in time, likewise.
+        least_reach: sites that the stencil takes up to the left and to the right at least.
     """
     if order not in (1, 2):
         raise InputError(f"order is {order!r}; it must be 1 (du/dt) or 2 (d^2u/dt^2)")
-    dynamics = Dynamics(terms, order, samples.is_complex, samples.sites, samples.ends, weights)
+    dynamics = Dynamics(terms, order, samples.is_complex, samples.sites, samples.ends, weights, factors, least_reach)
     fields = [samples.u] if order == 1 or samples.v is None else [samples.u, samples.v]
     value = np.stack([split_parts(one, samples.is_complex) for one in fields], axis=1)
     seen = np.isfinite(value)
     drive = _drive(samples, dynamics) if len(dynamics.border) else None
     inputs = None
     if samples.f is not None and any("f" in term.names for term in terms):
-        inputs = _input(samples)
+        inputs = samples.forcing()
     stretches = Stretches(dynamics, samples.t[:-1], samples.t[1:], inputs, drive)
     return Record(stretches, np.where(seen, value, 0.0), seen, samples.t)
 
@@ -145,20 +156,6 @@ def without_halves(samples: Samples) -> Samples:
     u = whole(samples.u)
     assert u is not None
     return replace(samples, u=u, v=whole(samples.v))
-
-
-def _input(samples: Samples) -> Any:
-    """Put a cubic spline through each site's measured input; gaps are bridged."""
-    from scipy.interpolate import make_interp_spline
-
-    assert samples.f is not None
-    f = samples.f.real.copy()
-    for site in range(f.shape[1]):
-        seen = np.isfinite(f[:, site])
-        if not np.any(seen):
-            raise InputError(f"{samples.source}: the measured input of site {site + 1} is missing throughout")
-        f[~seen, site] = np.interp(samples.t[~seen], samples.t[seen], f[seen, site])
-    return make_interp_spline(samples.t, f, k=min(3, len(samples.t) - 1))
 
 
 def smooth(samples: Samples, order: int) -> tuple[ndarray, ndarray | None]:
@@ -350,7 +347,14 @@ def _ends(records: Sequence[Record], state: State, substeps: Sequence[ndarray]) 
 
 
 def maximise(
-    records: Sequence[Record], state: State, *, steps: int = 40, tolerance: float = 1e-4, noise: ndarray | None = None
+    records: Sequence[Record],
+    state: State,
+    *,
+    steps: int = 40,
+    tolerance: float = 1e-4,
+    noise: ndarray | None = None,
+    held: bool = False,
+    accuracy: float = 1e-2,
 ) -> Solution:
     """Climb to the largest likelihood by Gauss-Newton steps from `state`.
 
@@ -361,6 +365,8 @@ def maximise(
         tolerance: it ends when no coefficient moves by more than this share of its standard error and the defects are as
             small beside the noise.
         noise: standard deviations of u and v, when they are known; estimated when None.
+        held: the coefficients are known, and only the states are fitted.
+        accuracy: of the integration from sample to sample, in units of the noise.
     """
     began = time.perf_counter()
     counts = np.asarray(sum(np.sum(record.seen, axis=(0, 2, 3)) for record in records), dtype=float)
@@ -380,18 +386,18 @@ def maximise(
     substeps = [np.ones(len(nodes) - 1, dtype=int) for nodes in state.nodes]
     point = _evaluate(records, state, _ends(records, state, substeps))
     sigma = np.maximum(estimate(point.misfit()), 1e-6 * height) if noise is None else estimate(point.misfit())
-    accuracy = np.inf
+    reached = np.inf
     path = []
     converged = False
     covariance = np.full((len(state.coefficients),) * 2, np.nan)
     for _ in range(steps):
         # The integration need not be better than the noise asks for.
-        wanted = 1e-2 * float(np.min(sigma))
+        wanted = accuracy * float(np.min(sigma))
         wanted = max(wanted, 1e-10 * float(np.max(height)))
-        if wanted < 0.5 * accuracy:
-            accuracy = wanted
+        if wanted < 0.5 * reached:
+            reached = wanted
             substeps = [
-                r.stretches.substeps(state.coefficients, nodes[:-1], accuracy, splines)
+                r.stretches.substeps(state.coefficients, nodes[:-1], tolerances(r, sigma, reached), splines)
                 for r, nodes, splines in zip(records, state.nodes, state.splines, strict=True)
             ]
         transitions = [
@@ -401,13 +407,22 @@ def maximise(
         if not all(np.all(np.isfinite(one.end)) for one in transitions):
             break
         point = _evaluate(records, state, [one.end for one in transitions])
-        condensed = []
-        for record, one, residual, defect in zip(records, transitions, point.residuals, point.defects, strict=True):
-            weight = record.seen / sigma[:, None, None]
-            condensed.append(_condense(record, one, weight, residual, defect))
-        rows = np.concatenate([one.rows for one in condensed])
+        with np.errstate(over="ignore", invalid="ignore"):
+            condensed = [
+                _condense(record, one, record.seen / sigma[:, None, None], residual, defect)
+                for record, one, residual, defect in zip(
+                    records, transitions, point.residuals, point.defects, strict=True
+                )
+            ]
+            rows = np.concatenate([one.rows for one in condensed])
+            # The motion may be finite and yet so sensitive that nothing can be said of it.
+            bounded = np.all(np.isfinite(np.sum(rows**2, axis=0)))
+        if not bounded:
+            break
         target = np.concatenate([one.target for one in condensed])
         change, covariance = _solve(rows, target)
+        if held:
+            change = np.zeros_like(change)
         error = np.sqrt(np.diag(covariance))
         moves = [one.moves(change) for one in condensed]
         sizes = [_sizes(record, sigma) for record in records]
@@ -440,11 +455,22 @@ def maximise(
         closed = max(float(np.max(np.abs(d) / s, initial=0.0)) for d, s in zip(point.defects, sizes, strict=True))
         steady = np.all(np.abs(sigma / before - 1) < max(1e-3, 0.1 * tolerance))
         # Without noise the samples are fitted to the integrator's error, and nothing more is to be had.
-        exact = np.all(sigma <= 10 * accuracy) and np.max(np.abs(change)) <= 1e-9 * np.max(np.abs(state.coefficients))
+        exact = np.all(sigma <= 10 * reached) and np.max(np.abs(change)) <= 1e-9 * np.max(np.abs(state.coefficients))
         if length == 1.0 and ((still and steady and closed < 0.1) or exact):
             converged = True
             break
     return Solution(state, sigma, covariance, point.misfit(), counts, free, converged, tuple(path))
+
+
+def from_weak_form(
+    data: Sequence[Samples], records: Sequence[Record], library: Library, order: int, seed: int
+) -> State | None:
+    """Start with the coefficients of the weak form and the smoothed states; None where it finds none."""
+    try:
+        coefficients = Weak().fit(data, library, order, seed).coefficients
+    except (InputError, np.linalg.LinAlgError):
+        return None
+    return replace(guess(data, records), coefficients=coefficients) if np.any(coefficients) else None
 
 
 def approach(data: Sequence[Samples], records: Sequence[Record], steps: int) -> State:
@@ -495,6 +521,15 @@ def _condense(record: Record, transition: Any, weight: ndarray, residual: ndarra
         weights[..., own].reshape(len(weight), -1), residuals[..., own].reshape(len(weight), -1), defect,
         weights[..., edge] if len(edge) else None, residuals[..., edge] if len(edge) else None,
     )  # fmt: skip
+
+
+def tolerances(record: Record, sigma: ndarray, least: float) -> Float[ndarray, " state"]:
+    """Give the accuracy that each number of a state needs, when that of the best known level is `least`.
+
+    A velocity that is not seen matters only by what it does to u until the next sample.
+    """
+    sizes = _sizes(record, sigma)
+    return np.asarray(least * np.maximum(sizes / np.min(sigma), 1.0))
 
 
 def _sizes(record: Record, sigma: ndarray) -> ndarray:
@@ -549,9 +584,9 @@ class Trajectory:
     @property
     def abilities(self) -> Abilities:
         """Anything goes."""
-        return Abilities(missing=True)
+        return Abilities(missing=True, motion=True, loads=LOADS)
 
-    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:  # noqa: ARG002
+    def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Fit by maximum likelihood, and select where asked to.
 
         Raises:
@@ -560,12 +595,23 @@ class Trajectory:
         data = [without_halves(samples) for samples in data]
         chosen = np.arange(len(library.terms))
         records: Sequence[Record] = [prepare(samples, library.terms, order) for samples in data]
-        solution = maximise(records, approach(data, records, self.steps), steps=self.steps, tolerance=self.tolerance)
-        if not solution.converged:
-            # Pieces may lead astray, above all where much is missing.
-            other = maximise(records, guess(data, records), steps=self.steps, tolerance=self.tolerance)
-            if other.converged or other.criterion < solution.criterion:
-                solution = other
+        # Pieces may lead astray, above all where much is missing; the weak form needs many samples, but knows no wrong turning.
+        begins = (
+            functools.partial(from_weak_form, data, records, library, order, seed),
+            functools.partial(approach, data, records, self.steps),
+            functools.partial(guess, data, records),
+        )
+        solution = None
+        for begin in begins:
+            state = begin()
+            if state is None:
+                continue
+            trial = maximise(records, state, steps=self.steps, tolerance=self.tolerance)
+            if solution is None or trial.converged or not trial.criterion >= solution.criterion:
+                solution = trial
+            if solution.converged:
+                break
+        assert solution is not None
         first = solution
         if self.select:
             chosen, records, solution = self._select(library, records, solution)
@@ -587,7 +633,7 @@ class Trajectory:
         return Fit(
             self.name, library, order, coefficients, _left(records, solution), stderr=stderr,
             status="ok" if solution.converged else "the fit did not converge; its last step is given",
-            history=history, found=found,
+            history=history, found=found, motion=tuple(map(_motion, data, records, solution.state.nodes, solution.state.splines)),
         )  # fmt: skip
 
     def _select(
@@ -612,6 +658,14 @@ class Trajectory:
 def _of(record: Record, library: Library, kept: ndarray) -> Dynamics:
     """Make the equation of fewer terms on the same chain."""
     return replace(record.stretches.dynamics, terms=tuple(library.terms[k] for k in kept))
+
+
+def _motion(samples: Samples, record: Record, nodes: ndarray, splines: ndarray | None) -> Samples:
+    """Write the states of a fit as samples: u and, for order 2, v at the sample times."""
+    stretches = record.stretches
+    whole = stretches.dynamics.whole(nodes, stretches.driven(record.times, splines))
+    fields = [part[:, 0] + 1j * part[:, 1] if samples.is_complex else part[:, 0] for part in np.moveaxis(whole, 1, 0)]
+    return replace(samples, u=fields[0], v=fields[1] if len(fields) > 1 else None)
 
 
 def _left(records: Sequence[Record], solution: Solution) -> float:

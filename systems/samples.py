@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
@@ -122,6 +122,27 @@ class Samples:
     def has_missing(self) -> bool:
         """Whether any value is NaN."""
         return any(bool(np.any(np.isnan(array))) for array in (self.u, self.v, self.f) if array is not None)
+
+    def forcing(self) -> Callable[[ndarray], ndarray]:
+        """Give the measured input at any time: a function of times (B,) with values (B, N).
+
+        Each site's is the cubic spline through its samples, after gaps have been bridged by straight lines.
+
+        Raises:
+            InputError: no input was measured, or that of a site is missing throughout.
+        """
+        from scipy.interpolate import make_interp_spline
+
+        if self.f is None:
+            raise InputError(f"{self.source}: there is no measured input f or f1..f{self.sites}")
+        f = self.f.real.copy()
+        for site in range(f.shape[1]):
+            seen = np.isfinite(f[:, site])
+            if not np.any(seen):
+                raise InputError(f"{self.source}: the measured input of site {site + 1} is missing throughout")
+            f[~seen, site] = np.interp(self.t[~seen], self.t[seen], f[seen, site])
+        curve: Callable[[ndarray], ndarray] = make_interp_spline(self.t, f, k=min(3, len(self.t) - 1))
+        return curve
 
     def mirrored(self) -> Samples:
         """Give the samples of -u, which an equation of odd terms has as a solution too."""

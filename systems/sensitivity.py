@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
 Input = Callable[["ndarray"], "ndarray"]
+Factor = Callable[["ndarray"], "ndarray"]
 
 # So many numbers of one stage are worked on at a time: twelve such arrays stay in the processor's cache.
 CHUNK = 60_000
@@ -110,7 +111,7 @@ class Transition:
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """d^order u_n / dt^order = sum_j xi_j w_jn T_j on a chain, for many states at once.
+    """d^order u_n / dt^order = sum_j xi_j w_jn g_jn(t) T_j on a chain, for many states at once.
 
     A state is [u] or [Re u, Im u] of the M sites that have an equation, for order 2 followed by the velocity likewise:
     S = order * parts * M numbers. Those are all N sites, or with unknown ends the ones whose whole stencil lies inside.
@@ -122,6 +123,10 @@ class Dynamics:
         sites: N.
         ends: how the chain ends.
         weights: w_jn (terms, N), 1 everywhere when None; a row of zeros with a single 1 makes a term of one site.
+        factors: g_jn, one a term or None for 1: gives at times (B,) an array that broadcasts to (parts, B, N), so that
+            T_j = 1 (1+i for a complex field) with a factor is any known force.
+        least_reach: the stencil is at least this wide, so that equations with different terms leave the same sites without
+            an equation at unknown ends.
     """
 
     terms: tuple[Term, ...]
@@ -130,11 +135,14 @@ class Dynamics:
     sites: int
     ends: Ends
     weights: Float[ndarray, "terms sites"] | None = None
+    factors: tuple[Factor | None, ...] | None = None
+    least_reach: tuple[int, int] = (0, 0)
 
     @functools.cached_property
     def reach(self) -> tuple[int, int]:
         """The widest stencil."""
-        return max(term.reach[0] for term in self.terms), max(term.reach[1] for term in self.terms)
+        left, right = self.least_reach
+        return max(left, *(term.reach[0] for term in self.terms)), max(right, *(term.reach[1] for term in self.terms))
 
     @property
     def parts(self) -> int:
@@ -192,6 +200,9 @@ class Dynamics:
             flat[k] = value
         if self.weights is not None:
             values *= self.weights[:, None, self.moving]
+        factors = self._factors(t)
+        for term, factor in factors.items():
+            values[:, term] *= factor
         rate = np.empty((len(t), self.order, self.parts, self.count))
         if self.order == 2:
             rate[:, 0] = y.reshape(rate.shape)[:, 1]
@@ -204,8 +215,19 @@ class Dynamics:
                 share = coefficients[term] * value
                 if self.weights is not None:
                     share = share * self.weights[term, self.moving]
+                if term in factors:
+                    share = share * factors[term][part]
                 found[part, slot] = found[part, slot] + share if (part, slot) in found else share
         return rate.reshape(y.shape), values, found
+
+    def _factors(self, t: ndarray) -> dict[int, ndarray]:
+        """Evaluate the factors at the sites that have an equation, each (parts, B, M)."""
+        found = {}
+        for term, factor in enumerate(self.factors or ()):
+            if factor is not None:
+                whole = np.broadcast_to(factor(t), (self.parts, len(t), self.sites))
+                found[term] = whole[..., self.moving]
+        return found
 
     @functools.cached_property
     def _values(self) -> Any:
@@ -326,10 +348,10 @@ class Stretches:
         self,
         coefficients: Float[ndarray, " terms"],
         start: Float[ndarray, "stretch state"],
-        tolerance: float,
+        tolerance: float | Float[ndarray, " state"],
         splines: ndarray | None = None,
     ) -> Int[ndarray, " stretch"]:
-        """Find how many steps each stretch needs, by halving until no state moves by more than `tolerance`."""
+        """Find how many steps each stretch needs, by halving until no number of a state moves by more than its tolerance."""
         needed = np.ones(len(start), dtype=int)
         open_ = np.arange(len(start))
         coarse = self.run(coefficients, start, needed, splines)
@@ -339,7 +361,7 @@ class Stretches:
             with np.errstate(all="ignore"):
                 # Two solutions that are both unbounded do not get better by shorter steps.
                 lost = ~np.all(np.isfinite(fine), axis=1)
-                wrong = ~(np.max(np.abs(fine - coarse), axis=1) <= tolerance) & ~lost
+                wrong = ~np.all(np.abs(fine - coarse) <= tolerance, axis=1) & ~lost
             open_, coarse = open_[wrong], fine[wrong]
             needed[open_] *= 2
         return needed

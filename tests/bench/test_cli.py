@@ -115,6 +115,34 @@ def test_a_complex_field_is_fitted_with_real_coefficients_of_t_and_i_t(folder: P
     assert found["i*abs(u[n])**2*u[n]"] == pytest.approx(1.0, abs=0.02)
 
 
+def test_the_limit_of_a_system_has_a_verdict_for_every_term_and_says_what_more_would_need(tmp_path: Path) -> None:
+    command = ["limit", "--system", "phi4", "--library", "lib3", "--noise", 0.02, "--sites", 15, "--samples", 30]
+    found = json.loads(succeed(*command, "--target", 0.001, "--json", "-", cwd=tmp_path))
+    assert list(found["terms"]) == ["u[n+1]", "u[n-1]", "u[n]", "u[n]**3", "u[n+2]", "u[n-2]"]
+    assert found["terms"]["u[n+1]"]["coefficient"] == 2.0
+    assert found["terms"]["u[n+1]"]["verdict"].startswith("known to ")
+    assert "its coefficient is 0" in found["terms"]["u[n+2]"]["verdict"]
+    assert (found["samples"], found["noise"]) == (30, 0.02)
+    needed = found["needed"]
+    assert needed["noise"] == pytest.approx(0.02 * 0.001 / found["relative"])
+    out = succeed(*command, "--target", 0.001, "--json", "limit.json", cwd=tmp_path)
+    assert json.loads((tmp_path / "limit.json").read_text()) == found
+    for word in ("known to", "0.1 % would need a noise level of", f"or {needed['records']} records like this one"):
+        assert word in out
+    untold = json.loads(succeed(*command, "--ends", "unknown", "--no-velocities", "--json", "-", cwd=tmp_path))
+    assert untold["relative"] > found["relative"]
+
+
+def test_the_limit_of_a_file_is_near_the_one_of_the_system_that_it_came_from(folder: Path) -> None:
+    about = ["--system", "phi4", "--library", "lib2", "--json", "-"]
+    told = json.loads(succeed("limit", *about, "--set", "v=0.5", "--set", "C=2", "--noise", 0.001, cwd=folder))
+    found = json.loads(succeed("limit", "phi4.csv", "--ends", "free", *about, cwd=folder))
+    assert found["noise"] == pytest.approx(0.001, rel=0.1)
+    assert found["relative"] == pytest.approx(told["relative"], rel=0.1)
+    assert found["needed"]["span"] is not None
+    assert "within reach as things are" in succeed("limit", "phi4.csv", "--ends", "free", *about[:4], cwd=folder)
+
+
 def test_a_run_its_table_its_figures_and_its_comparison(tmp_path: Path) -> None:
     out = succeed("run", "tiny", "--jobs", 2, "--results", "tiny", cwd=tmp_path)
     assert "9 cases (9 ok); 9 run now, 0 were there" in out
@@ -128,6 +156,14 @@ def test_a_run_its_table_its_figures_and_its_comparison(tmp_path: Path) -> None:
             text = (tmp_path / "published" / f"{name}.{form}").read_text()
             for word in ("command: latticebench run tiny", "commit: ", "machine: ", "versions: ", "seeds: 1"):
                 assert word in text
+    assert "known to" in (tmp_path / "published" / "coefficients.md").read_text()
+    one = succeed("table", "tiny", "--only", "limits", "--out", "one", cwd=tmp_path)
+    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == ["limits.csv", "limits.md", "limits.tex"]
+    assert "bound" in one
+    assert (
+        "unknown figure 'cots'; did you mean 'cost'"
+        in latticebench("figures", "tiny", "--only", "cots", cwd=tmp_path).stderr
+    )
     files = succeed("figures", "tiny", "--out", "published", cwd=tmp_path).split()
     assert {Path(file).name for file in files} >= {"errors.png", "error-against-seconds.png", "error-against-noise.png"}
     assert all((tmp_path / file).stat().st_size > 5000 for file in files)
@@ -242,6 +278,20 @@ BAD_COMMANDS = {
     "table .": "not a store",
     "figures .": "not a store",
     "compare phi4.csv phi4.csv": "column 'identity' is missing",
+    "limit --system phi4": "--library",
+    "limit --terms u[n] --order 2": "--system",
+    "limit --system phi4 --library lib2 --noise 0": "must be a number above 0",
+    "limit --system phi4 --library lib2 --target -1": "target",
+    "limit --system phi4 --library lib2 --sites 0": "--sites",
+    "limit --system phi4 --library lib2 --set D=2": "unknown parameter 'D'",
+    "limit --system phi4 --library lib2 --initial knik": "did you mean 'kink'",
+    "limit --system phi4 --terms u[n]": "outside the library",
+    "limit phi4.csv --system phi4 --library lib2 --noise 0.1": "--noise: files are given",
+    "limit phi4.csv --system phi4 --terms f[n]": "no measured input",
+    "limit still.csv --terms u[n] --order 2": "still.csv: nothing moves",
+    "limit huge.csv --terms u[n] --order 2": "huge.csv",
+    "limit nowhere.csv --system phi4 --library lib1": "nowhere.csv: no such file",
+    "table . --only case": "unknown table 'case'; did you mean 'cases'",
     "lists systems": "No such command",
     "list system": "systems",
 }

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import matplotlib.image
+import numpy as np
+import pandas as pd
 from PIL import Image
 
 from bench.case import blank
-from bench.figures import draw_all, panel
+from bench.figures import draw_all, error_against_noise, panel
 from bench.suite import Case
 
 
@@ -52,7 +54,27 @@ def test_every_figure_is_written_with_its_provenance(tmp_path: Path) -> None:
         "cost.png",
     }
     assert sum(path.name.startswith("coefficients-") for path in paths) == 2
+    assert [path.name for path in draw_all([learned(), other], {}, tmp_path / "one", ["cost"])] == ["cost.png"]
     for path in paths:
         assert matplotlib.image.imread(path).std() > 0.01
         with Image.open(path) as image:
             assert "command: latticebench run x" in image.text["Description"]
+
+
+def test_error_against_noise_has_a_line_a_method_and_the_bound_as_its_dashed_floor() -> None:
+    rows = [
+        {
+            "part": "", "data": f"phi4 noise={noise} known ends", "library": "lib1", "method": method, "noise": noise,
+            "seed": seed, "status": "ok", "e2": scale * noise * seed, "bound": 0.1 * noise if noise else None,
+        }
+        for method, scale in (("good", 0.1), ("poor", 3.0)) for noise in (0.0, 0.01, 0.1) for seed in (1, 2, 4)
+    ]  # fmt: skip
+    axes = error_against_noise(pd.DataFrame(rows)).axes[0]
+    lines = {str(line.get_label()): line for line in axes.lines}
+    np.testing.assert_allclose(lines["good"].get_ydata(), [0.002, 0.02])
+    np.testing.assert_allclose(lines["poor"].get_ydata(), [0.06, 0.6])
+    floor = lines["Cramer-Rao bound"]
+    assert floor.get_linestyle() == "--"
+    np.testing.assert_allclose(floor.get_xdata(), [0.01, 0.1])
+    np.testing.assert_allclose(floor.get_ydata(), [0.001, 0.01])
+    assert axes.get_title() == "phi4, lib1"

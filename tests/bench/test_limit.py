@@ -7,12 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import systems
-from bench.limit import Limit, bound, design
+from bench.limit import Limit, bound, bound_along, bound_of, bound_of_fit, denser, design
+from methods.method import solve
 from methods.trajectory import Trajectory
 from systems.errors import InputError
 from systems.lattice import library
+from systems.samples import Samples
 from systems.simulate import observe, sample_times, simulate
 
 
@@ -107,14 +110,111 @@ def test_verdicts_tell_known_coefficients_from_sums():
     assert alone.verdicts[0] == "cannot be known from these samples"
 
 
-def test_design_scales_the_noise_and_finds_the_record():
+def test_a_coefficient_that_cannot_be_told_from_0_is_known_as_a_share_of_the_derivative():
+    terms = library("four", "u[n]; u[n]**3; u[n]**5; u[n]**7")
+    covariance = np.diag([0.04, 0.04, 0.04, 4.0])
+    limit = Limit(terms, np.array([1.0, 0.1, 0.0, 0.1]), covariance, np.full(4, 0.25), 10.0, 0.01, 50, 10.0)
+    assert limit.verdicts == (
+        "known only to 20 %",
+        "known to 5 % of the derivative, and cannot be told from 0",
+        "known to 5 % of the derivative (its coefficient is 0)",
+        "known only to 50 % of the derivative, and cannot be told from 0",
+    )
+
+
+def test_values_that_are_missing_tell_nothing():
+    system = systems.find("phi4")
+    one = system.library("lib2")
+    clean = replace(simulate(system), ends="free")
+    every_other = np.where(np.arange(len(clean.t)) % 2, 0.0, np.nan)[:, None]
+    half = replace(clean, u=clean.u + every_other, v=clean.v + every_other)
+    thin = bound(system, one, times=clean.t[1::2])
+    # The same values are seen; the start of the motion is unknown either way.
+    np.testing.assert_allclose(bound_of([half], one, 2, noise=0.01).stderr, thin.stderr, rtol=0.02)
+    gaps = observe(clean, np.random.default_rng(0), missing=0.5)
+    assert np.all(bound_of([gaps], one, 2, noise=0.01).stderr > 1.2 * bound(system, one).stderr)
+
+
+def oscillator(noise, seed=0):
+    """Samples of u of u'' = -2 u - 0.3 v + 0.7 f, and its motion for any coefficients and start."""
+    t = np.linspace(0, 20, 201)
+
+    def force(at):
+        return np.sin(1.3 * at) + 0.5 * np.cos(0.4 * at)
+
+    def motion(p):
+        return solve_ivp(
+            lambda at, y: [y[1], p[0] * y[0] + p[1] * y[1] + p[2] * force(at)], (0, 20), p[3:],
+            t_eval=t, rtol=1e-11, atol=1e-13,
+        ).y  # fmt: skip
+
+    noisy = motion([-2.0, -0.3, 0.7, 1.0, 0.0])[0] + noise * np.random.default_rng(seed).normal(size=len(t))
+    return Samples(t, noisy[:, None], f=force(t)[:, None], ends="free"), motion
+
+
+def test_the_bound_with_a_measured_input_is_the_one_from_finite_differences():
+    samples, motion = oscillator(0.01)
+    true = np.array([-2.0, -0.3, 0.7, 1.0, 0.0])
+    steps = 1e-5 * np.eye(5)
+    slopes = np.stack([(motion(true + h)[0] - motion(true - h)[0]) / 2e-5 for h in steps], axis=1)
+    expected = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))[:3] * 0.01
+    u, v = motion(true)
+    exact = replace(samples, u=u[:, None], v=v[:, None])
+    terms = library("oscillator", "u[n]; v[n]; f[n]")
+    found = bound_along([samples], [exact], terms, 2, true[:3], sizes=[0.01])
+    np.testing.assert_allclose(found.stderr, expected, rtol=1e-3)
+    assert found.noise == pytest.approx(0.01 / np.std(u))
+
+
+def test_the_bound_of_a_fit_stands_for_measured_samples():
+    samples, _ = oscillator(0.01)
+    terms = library("oscillator", "u[n]; v[n]; f[n]")
+    fit = solve(Trajectory(), [samples], terms, 2, 0)
+    found = bound_of_fit([samples], fit)
+    np.testing.assert_allclose(found.stderr, fit.stderr, rtol=0.02)
+    np.testing.assert_array_equal(found.coefficients, fit.coefficients)
+    # Four times the samples at the same noise, and the same record four times over.
+    np.testing.assert_allclose(denser([samples], fit, 4).stderr, found.stderr / 2, rtol=0.02)
+    with pytest.raises(InputError, match="follows no motion"):
+        bound_of_fit([samples], replace(fit, motion=None))
+
+
+@pytest.mark.parametrize(("name", "candidates"), [("phi4", "lib2"), ("dnls", "four")])
+def test_the_bound_of_a_fit_to_simulated_samples_is_near_the_bound_at_the_truth(name, candidates):
+    system = systems.find(name)
+    one = system.library(candidates)
+    samples = replace(observe(simulate(system), np.random.default_rng(1), noise=0.01).observed(), ends="unknown")
+    fit = solve(Trajectory(), [samples], one, system.order, 0)
+    at_truth = bound(system, one, known_ends=False)
+    assert bound_of_fit([samples], fit).relative == pytest.approx(at_truth.relative, rel=0.15)
+
+
+def test_design_scales_the_noise_and_finds_samples_and_record():
     system = systems.find("phi4")
     one = system.library("equation")
-    found = design(system, one, target=0.001, velocities=False, times=sample_times(20, 4.0), sites=15, doublings=2)
-    assert bound(
-        system, one, velocities=False, times=sample_times(20, 4.0), sites=15, noise=found.noise
-    ).relative == pytest.approx(0.001)
-    assert found.span is None or found.span > 3.8
+
+    def at(more, longer, noise=0.01):
+        times = 0.2 * np.arange(20 * more * longer) / more
+        return bound(system, one, velocities=False, times=times, sites=15, noise=noise)
+
+    found = design(at, target=0.001, doublings=3)
+    assert at(1, 1, found.noise).relative == pytest.approx(0.001)
+    assert found.relative == at(1, 1).relative > 0.001
+    assert found.records == int(np.ceil((found.relative / 0.001) ** 2))
+    assert found.span is not None
+    assert found.span > 3.8
+    assert at(1, 8).relative < 0.001
+    easy = design(at, target=0.5)
+    assert (easy.samples, easy.span, easy.records) == (20, pytest.approx(3.8), 1)
+
+    def here_only(more, longer):
+        if longer > 1:
+            raise InputError("the record has ended")
+        return at(more, longer)
+
+    assert design(here_only, target=0.001, doublings=1).span is None
+    with pytest.raises(InputError, match="target"):
+        design(at, target=0.0)
 
 
 def test_what_cannot_be_bounded_is_refused():

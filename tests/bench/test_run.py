@@ -10,13 +10,18 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
+import systems
+from bench.case import run_case
+from bench.limit import bound
 from bench.run import run
 from bench.store import create
-from bench.suite import Suite, load
+from bench.suite import Case, Suite, load
+from systems.simulate import sample_times
 
 HERE = Path(__file__).parent
 posix = pytest.mark.skipif(os.name != "posix", reason="sends POSIX signals")
@@ -196,3 +201,24 @@ def test_a_table_shows_the_suite_that_was_run_last_and_where_each_result_came_fr
     assert len(store.paths()) == 2
     assert store.about()["command"] == "latticebench run s"
     assert {"commit", "date", "machine", "versions"} == set(store.all()[0]["made"])
+
+
+def test_a_noisy_case_holds_its_bound_and_one_without_noise_or_truth_none(tmp_path: Path) -> None:
+    def case(**changed: Any) -> Case:
+        return Case(**{
+            "system": "phi4", "sites": 9, "samples": 20, "noise": 0.01, "library": "lib2", "label": "a", "method": "zero", **changed
+        })  # fmt: skip
+
+    found = run_case(case(known_ends=True), tmp_path)
+    system = systems.find("phi4")
+    direct = bound(system, system.library("lib2"), sites=9, times=sample_times(20), noise=0.01)
+    assert found["bound"] == pytest.approx(direct.relative, rel=1e-6)
+    assert list(found["bounds"].values()) == pytest.approx(list(direct.stderr), rel=1e-6)
+    assert tuple(found["verdicts"].values()) == direct.verdicts
+    # Neither the seed of the noise, nor mirrored samples of the same noise, say more about the coefficients.
+    assert run_case(case(known_ends=True, seed=2, mirror=True), tmp_path)["bound"] == found["bound"]
+    assert run_case(case(), tmp_path)["bound"] > found["bound"]
+    for without in (case(noise=0.0), case(terms=("u[n]",), library="own"), case(sites=301, samples=100, span=1.0)):
+        result = run_case(without, tmp_path)
+        assert result["status"] == "ok"
+        assert (result["bound"], result["bounds"], result["verdicts"]) == (None, None, None)

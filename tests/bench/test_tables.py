@@ -13,7 +13,7 @@ from bench.case import blank
 from bench.compare import compare
 from bench.provenance import describe, origin
 from bench.suite import Case
-from bench.tables import cases, coefficients, format_number, matrix, publish, read_cases, summary
+from bench.tables import cases, coefficients, format_number, limits, matrix, publish, read_cases, summary
 from systems.errors import InputError
 
 ORIGIN = origin()
@@ -61,6 +61,33 @@ def test_a_failure_counts_as_infinite_and_stays_in_the_median_and_a_skip_leaves_
     assert list(short.loc["lib1", "ok"]) == ["2/3", "1/3", "0/3", "3/3"]
 
 
+def test_the_efficiency_is_the_bound_over_the_root_mean_square_error_of_the_seeds() -> None:
+    def bounded(method: str, seed: int, e2: float | None, status: str = "ok") -> dict[str, Any]:
+        verdicts = {"u[n]": "known to 1 %", "abs(u[n])": "cannot be known from these samples"}
+        if status != "ok":
+            return result(method, seed, e2, status)
+        return {
+            **result(method, seed, e2, status), "bound": 0.02, "bounds": {"u[n]": 0.02, "abs(u[n])": 0.5}, "verdicts": verdicts
+        }  # fmt: skip
+
+    errors = {"a": [0.03, 0.04, 0.0], "b": [0.02, 0.02, None], "c": [0.02, 0.02]}
+    found = [
+        bounded(method, seed, e2, "ok" if e2 is not None else "timeout")
+        for method, values in errors.items() for seed, e2 in enumerate(values)
+    ]  # fmt: skip
+    short = summary(cases(found)).set_index("method")["efficiency"]
+    assert short["a"] == pytest.approx(0.02 / np.sqrt(0.0025 / 3))
+    assert short["b"] == 0.0
+    assert np.isnan(short["c"])
+    wide = matrix(cases(found))
+    assert list(wide["bound"]) == ["0.02"]
+    assert "bound" not in matrix(cases(RESULTS))
+    table = limits(found)
+    assert list(table["term"]) == ["u[n]", "abs(u[n])"]
+    assert list(table["verdict"]) == ["known to 1 %", "cannot be known from these samples"]
+    assert list(coefficients(found)["verdict"][:2]) == list(table["verdict"])
+
+
 def test_a_cell_without_a_figure_says_why() -> None:
     wide = matrix(cases(RESULTS)).set_index("library")
     assert list(wide.loc["lib1", ["a", "b", "c", "d"]]) == ["0.3", "inf", "skipped", "0.1"]
@@ -97,6 +124,14 @@ def test_what_is_published_can_be_read_and_carries_where_it_comes_from(tmp_path:
     tex = (tmp_path / "coefficients.tex").read_text()
     assert r"$\left|{u_{n}}\right|$" in tex
     assert r"forecast\_error" in (tmp_path / "cases.tex").read_text()
+
+
+def test_a_table_can_be_published_alone_and_a_long_one_for_programs_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bench.tables.MOST_READ", len(RESULTS) - 1)
+    paths = publish(RESULTS, ABOUT, tmp_path, ["cases", "errors"])
+    assert [path.name for path in paths] == ["cases.csv", "errors.csv", "errors.md", "errors.tex"]
 
 
 def test_a_file_that_is_no_table_of_cases_is_refused(tmp_path: Path) -> None:

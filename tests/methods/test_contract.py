@@ -178,3 +178,24 @@ def test_the_mirror_image_of_an_odd_equation_has_the_same_truth_and_another_has_
     np.testing.assert_allclose(fit.coefficients, [2, 2, -2, -2], rtol=1e-10)
     with pytest.raises(InputError, match="not odd"):
         dataclasses.replace(phi4, equation="u[n]**2").mirrored()
+
+
+@pytest.mark.parametrize("data", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_that_says_so_gives_the_motion_and_the_noise_beside_it(
+    name: str, data: str, request: pytest.FixtureRequest
+) -> None:
+    samples = request.getfixturevalue(data)
+    system = systems.find(data)
+    fit = attempt(name, samples, system.library("lib2" if data == "phi4" else "four"), system.order)
+    if isinstance(fit, str) or not methods.find(name)().abilities.motion:
+        return
+    assert fit.motion is not None
+    (motion,) = fit.motion
+    noise = np.std(samples.u - samples.exact.u) / np.sqrt(1 + samples.is_complex)
+    assert float(fit.found["noise_u"]) == pytest.approx(noise, rel=0.3)
+    # Nearer to the truth than the samples are.
+    assert np.std(motion.u - samples.exact.u) < 0.8 * np.std(samples.u - samples.exact.u)
+    if system.order == 2:
+        assert np.std(motion.v - samples.exact.v) < 0.8 * np.std(samples.v - samples.exact.v)
+        assert "noise_v" in fit.found

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
 
 import systems
 from bench.limit import bound
 from methods.method import solve
-from methods.trajectory import Trajectory
+from methods.trajectory import Trajectory, guess, maximise, prepare
 from systems.lattice import library
 from systems.samples import Samples
 from systems.sensitivity import Drive, Dynamics, Stretches
@@ -197,3 +198,55 @@ def test_intervals_cover_and_the_bound_is_reached_over_200_seeds(name, candidate
         assert 0.9 <= np.mean(np.abs(scores) < 1.96) <= 0.99
         spread = np.sqrt(np.mean([error(fit, truth) ** 2 for fit in fits]))
         assert bound(system, one, noise=noise).relative / spread > 0.85
+
+
+def test_the_start_from_the_weak_form_finds_what_pieces_lose():
+    one = systems.find("phi4").library("lib2")
+    fit = solve(Trajectory(), [seen("phi4", 0.1, 6)], one, 2, 0)
+    assert fit.status == "ok"
+    assert error(fit, [2.0, 2.0, -2.0, -2.0]) < 0.02
+
+
+def test_where_the_weak_form_gives_no_start_pieces_lead_to_the_same_fit(monkeypatch):
+    one = systems.find("phi4").library("lib2")
+    samples = seen("phi4", 0.01, 0)
+    usual = solve(Trajectory(), [samples], one, 2, 0)
+    monkeypatch.setattr("methods.trajectory.from_weak_form", lambda *_: None)
+    other = solve(Trajectory(), [samples], one, 2, 0)
+    assert np.max(np.abs(other.coefficients - usual.coefficients) / usual.stderr) < 0.01
+    # Too few samples for a weak form.
+    few = seen("phi4", 0.001, 0, times=sample_times(5, 1.0))
+    assert error(solve(Trajectory(), [few], one, 2, 0), [2.0, 2.0, -2.0, -2.0]) < 0.1
+
+
+@pytest.mark.parametrize(("name", "off"), [("phi4", 1.0), ("phi4", 1.05), ("dnls", 1.0)])
+def test_with_the_coefficients_held_only_the_states_are_fitted_and_are_those_of_scipys_least_squares(name, off):
+    system = systems.find(name)
+    one = system.library("equation")
+    samples = seen(name, 0.03, 4, sites=5, times=sample_times(20, 4.0))
+    record = prepare(samples, one.terms, system.order)
+    known = off * system.truth(one, {})
+    start = replace(guess([samples], [record]), coefficients=known)
+    found = maximise([record], start, held=True)
+    assert np.array_equal(found.state.coefficients, known)
+    free = maximise([record], start)
+    assert not np.array_equal(free.state.coefficients, known)
+    assert np.sum(free.misfit / found.sigma**2) <= np.sum(found.misfit / found.sigma**2) + 1e-6
+    dynamics = record.stretches.dynamics
+    levels = record.value.shape[1]
+
+    def rate(t, y):
+        return dynamics.linear(known, np.array([t]), y[None], derivatives=False)[0][0]
+
+    def left(y):
+        path = solve_ivp(rate, samples.t[[0, -1]], y, t_eval=samples.t, method="DOP853", rtol=1e-9, atol=1e-10).y.T
+        whole = dynamics.whole(path, None)[:, :levels]
+        return ((record.value - whole) / found.sigma[:, None, None]).ravel()
+
+    best = least_squares(left, found.state.nodes[0][0], x_scale=0.1)
+    error_of = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)))
+    assert np.max(np.abs(found.state.nodes[0][0] - best.x) / error_of) < 0.05
+    # The states between follow the motion.
+    np.testing.assert_allclose(
+        left(found.state.nodes[0][0]) ** 2 @ np.ones(record.value.size), 2 * best.cost, rtol=1e-3
+    )

@@ -1,0 +1,605 @@
+"""The loop: test whether anything is missing, trace it, add it, and again, until nothing is left or nothing explains it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from bench.loop.model import Change, Fitted, Model, carried, cut, first_fit, refit
+from bench.loop.residual import Forecast, alike, dynamics_share, forecast, noise, noise_of_readings, over_noise, pooled
+from bench.loop.tangent import Tangent, linearise
+from bench.loop.trace import Finding, screen
+from methods.method import check_fit
+from systems.effects import Effect
+from systems.lattice import Library
+from systems.samples import Samples, SimulatedSamples
+from systems.sensitivity import split_parts
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+# Chance of calling something missing where nothing is, over everything that is tried in a round.
+FALSE_ALARM = 0.004
+# Effects whose evidence is this near the best one's cannot be told from it (natural logarithms).
+EQUAL = 3.0
+# So much better must a term without a name be before no name is given.
+BETTER = 5.0
+# Effects refitted in a round, at most.
+FULL_FITS = 8
+MOST_EFFECTS = 4
+POLISH = 8
+# A residual of more than so many times the noise is gross: the model is then followed over shorter pieces.
+GROSS = 3.0
+MOST_PIECES = 64
+LONGEST = 4000
+# Thinning leaves at least so many samples.
+ENOUGH = 500
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An effect that was tried, in the screen and, where it came near, by a fit of its own.
+
+    Attributes:
+        finding: what the screen says.
+        gain: twice the log likelihood ratio, of its own fit where there was one.
+        evidence: the ranking goes by it.
+        p: chance that noise alone does as well, corrected for the search.
+        fitted: the model with it, or None.
+    """
+
+    finding: Finding
+    gain: float
+    evidence: float
+    p: float
+    fitted: Fitted | None = None
+
+    @property
+    def name(self) -> str:
+        """The effect, or the term without a name."""
+        return self.finding.name
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One turn of the loop.
+
+    Attributes:
+        ranking: all that was tried, the best first.
+        added: the effect that was added, or None.
+        equal: the names of effects that explain it as well.
+    """
+
+    ranking: tuple[Candidate, ...]
+    added: str | None = None
+    equal: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """How the loop went.
+
+    Attributes:
+        before: the declared equation's fit.
+        after: the fit with everything that was added.
+        equal: for each change of the last model, the effects that cannot be told from it.
+        rounds: the turns.
+        left: what is significant in the last residual, the best first.
+        verdict: "nothing missing", "explained", "partly explained" or "unexplained".
+    """
+
+    before: Fitted
+    after: Fitted
+    equal: tuple[tuple[str, ...], ...]
+    rounds: tuple[Round, ...]
+    left: tuple[Finding, ...]
+    verdict: str
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What the loop found, and the errors before and after.
+
+    Attributes:
+        course: how it went.
+        noise: standard deviation of the noise on u and, where it was observed, v; of each part of a complex field.
+        residual: of the forecast in units of the noise, before and after.
+        dynamics: RMS of what the equation leaves of the derivative over that of the derivative, before and after.
+        forecasts: of the held-out data, before and after; one a trajectory.
+        criterion: the Bayesian information criterion, before and after, less a common constant.
+        coefficients: relative error of the declared coefficients, |xi - xi*| / |xi*|, before and after, where a truth is known.
+        truth: the true declared coefficients, or None.
+    """
+
+    course: Course
+    noise: Float[ndarray, " levels"]
+    residual: tuple[float, float]
+    dynamics: tuple[float, float]
+    forecasts: tuple[list[Forecast], list[Forecast]]
+    criterion: tuple[float, float]
+    coefficients: tuple[float, float] | None = None
+    truth: Float[ndarray, " terms"] | None = None
+
+    @property
+    def forecast(self) -> tuple[float, float]:
+        """Root mean square error of the forecasts over that of the readings, before and after."""
+        return pooled(self.forecasts[0]), pooled(self.forecasts[1])
+
+
+Watcher = Callable[[str], None]
+
+
+def diagnose(
+    declared: Library,
+    order: int,
+    data: Sequence[Samples],
+    catalogue: Sequence[Effect],
+    seed: int = 1,
+    *,
+    held_out: Sequence[Samples] = (),
+    truth: Float[ndarray, " terms"] | None = None,
+    watcher: Watcher = lambda _: None,
+) -> Diagnosis:
+    """Run the loop on recordings.
+
+    Args:
+        declared: terms of the equation that is believed, their coefficients free.
+        order: of the time derivative.
+        data: recordings; a simulated one's truth is not looked at.
+        catalogue: effects that may be missing.
+        seed: of the surrogates.
+        held_out: recordings to judge forecasts on; the last 30 % of each of `data` when there are none.
+        truth: the declared coefficients' true values, only to report their error.
+        watcher: is told what is being done.
+
+    Raises:
+        InputError: the equation cannot be set up on the data.
+    """
+    shown = [one.observed() if isinstance(one, SimulatedSamples) else one for one in data]
+    check_fit(shown, declared, order)
+    # More threads than this are slower on matrices of these sizes.
+    with threadpool_limits(1):
+        course = close(Model(declared, order), shown, catalogue, np.random.default_rng(seed), watcher=watcher)
+        return _judge(course, declared, held_out, truth, watcher)
+
+
+def _judge(
+    course: Course,
+    declared: Library,
+    held_out: Sequence[Samples],
+    truth: Float[ndarray, " terms"] | None,
+    watcher: Watcher,
+) -> Diagnosis:
+    """Measure the errors before and after."""
+    watcher("forecasting")
+    sides = (course.before, alike(course.after, course.before))
+    size = noise(course.after)
+    gain = course.after.gain(course.before)
+    more = course.after.parameters - course.before.parameters
+    errors = None
+    if truth is not None:
+        count = len(declared.terms)
+        errors = [
+            float(np.linalg.norm(one.solution.state.coefficients[:count] - truth) / np.linalg.norm(truth))
+            for one in sides
+        ]
+    return Diagnosis(
+        course, size,
+        (over_noise(course.before, size), over_noise(course.after, size)),
+        (dynamics_share(course.before), dynamics_share(course.after)),
+        (forecast(sides[0], held_out), forecast(sides[1], held_out)),
+        (0.0, more * float(np.log(course.after.count)) - gain),
+        None if errors is None else (errors[0], errors[1]), truth,
+    )  # fmt: skip
+
+
+def close(
+    model: Model,
+    data: Sequence[Samples],
+    catalogue: Sequence[Effect],
+    draw: np.random.Generator,
+    *,
+    watcher: Watcher = lambda _: None,
+    most: int = MOST_EFFECTS,
+    surrogates: int = 200,
+) -> Course:
+    """Go round the loop.
+
+    A long record that is sampled far more densely than it moves is thinned first.
+
+    Args:
+        model: the declared equation.
+        data: recordings.
+        catalogue: the effects that may be missing.
+        draw: for the surrogates.
+        watcher: is told what is being done.
+        most: effects that are added at most.
+        surrogates: simulated recordings that the null distribution comes from.
+    """
+    watcher("fitting the declared equation")
+    horizon = Horizon.of([thinned(samples, model.order) for samples in data], model)
+    before = horizon.first(model)
+    fitted = before
+    rounds: list[Round] = []
+    equal: list[tuple[str, ...]] = []
+    doubted: _Doubted | None = None
+    left: tuple[Finding, ...] = ()
+    while True:
+        watcher(f"tracing what is left, round {len(rounds) + 1}")
+        findings = screen(linearise(fitted), catalogue, draw, surrogates)
+        left = significant(findings)
+        named = [one for one in findings if one.named]
+        if not left or len(fitted.model.changes) >= most:
+            rounds.append(Round(tuple(_unfitted(findings))))
+            break
+        ranking = _contest(fitted, findings, watcher)
+        best = next((one for one in ranking if one.fitted is not None), None)
+        count = len(named)
+        if best is None or best.fitted is None or best.p * count > FALSE_ALARM:
+            rounds.append(Round(tuple(ranking)))
+            break
+        unnamed = max((one.evidence for one in findings if not one.named), default=0.0)
+        if doubted is not None:
+            # The second of two names: together they must do what the term without a name did alone.
+            if best.evidence + doubted.named < doubted.unnamed - EQUAL:
+                rounds.append(Round(tuple(ranking)))
+                break
+            doubted = None
+        elif unnamed > best.evidence + BETTER and horizon.sees_all(fitted):
+            doubted = _Doubted(fitted, tuple(equal), len(rounds), best.evidence, unnamed)
+        alike = tuple(
+            one.name for one in ranking
+            if one is not best and one.fitted is not None and one.evidence > best.evidence - EQUAL
+        )  # fmt: skip
+        rounds.append(Round(tuple(ranking), best.name, alike))
+        fitted, equal = best.fitted, [*equal, alike]
+        fitted, equal = _prune(fitted, equal)
+        watcher("looking farther")
+        fitted = settled(horizon.lengthen(fitted))
+    if doubted is not None:
+        # A term without a name explains more than every name, alone or with another: none of them is right.
+        fitted, equal = doubted.fitted, list(doubted.equal)
+        rounds = rounds[: doubted.round + 1]
+        rounds[-1] = replace(rounds[-1], added=None, equal=())
+        left = significant([one.finding for one in rounds[-1].ranking])
+    fitted, equal = _prune(fitted, equal, all_of_them=True)
+    if len(fitted.model.changes) > 1:
+        fitted, equal, left = _reconsider(fitted, equal, left, catalogue, draw, surrogates, watcher)
+    verdict = (
+        ("partly explained" if left else "explained")
+        if fitted.model.changes
+        else ("unexplained" if left else "nothing missing")
+    )
+    return Course(before, fitted, tuple(equal), tuple(rounds), left, verdict)
+
+
+@dataclass(frozen=True, eq=False)
+class _Doubted:
+    """Where the loop was when a term without a name did better than the best name, and the evidence of both."""
+
+    fitted: Fitted
+    equal: tuple[tuple[str, ...], ...]
+    round: int
+    named: float
+    unnamed: float
+
+
+@dataclass(frozen=True, eq=False)
+class Horizon:
+    """How far the model is followed without a new start: as far as it can go without losing the readings.
+
+    Attributes:
+        data: the whole trajectories.
+        noise: of the readings, estimated from them alone; NaN where that cannot be done.
+        lengths: of pieces in samples, from whole trajectories down.
+    """
+
+    data: tuple[Samples, ...]
+    noise: Float[ndarray, " levels"]
+    lengths: tuple[int, ...]
+
+    @classmethod
+    def of(cls, data: Sequence[Samples], model: Model) -> Horizon:
+        """Find the lengths that make sense."""
+        longest = max(len(samples.t) for samples in data)
+        levels = 1 if model.order == 1 or data[0].v is None else 2
+        least = max(4 * model.order // levels + 2, -(-sum(len(samples.t) for samples in data) // MOST_PIECES))
+        lengths = [min(longest, LONGEST)]
+        while lengths[-1] / 3 >= least:
+            lengths.append(-(-lengths[-1] // 3))
+        return cls(tuple(data), noise_of_readings(data, model.order, levels), tuple(lengths))
+
+    def follows(self, fitted: Fitted) -> bool:
+        """Say whether a model does not lose the readings."""
+        if not fitted.solution.converged:
+            return False
+        if not np.all(np.isfinite(self.noise)):
+            return True
+        return over_noise(fitted, self.noise) < GROSS
+
+    def sees_all(self, fitted: Fitted) -> bool:
+        """Say whether a model follows the readings from end to end, so that small differences between terms mean something."""
+        return self.follows(fitted) and max(len(samples.t) for samples in fitted.data) >= self.lengths[0]
+
+    def first(self, model: Model) -> Fitted:
+        """Fit a model as far as it can follow; the shortest pieces where it never does."""
+        for length in self.lengths:
+            last = length == self.lengths[-1]
+            fitted = first_fit(model, cut(self.data, length), steps=40 if last else 15)
+            if self.follows(fitted):
+                break
+        return fitted
+
+    def lengthen(self, fitted: Fitted) -> Fitted:
+        """Fit a model to longer pieces as long as it follows them."""
+        present = max(len(samples.t) for samples in fitted.data)
+        for length in reversed(self.lengths):
+            if length <= present:
+                continue
+            pieces = cut(self.data, length)
+            longer = polish(
+                fitted.model,
+                replace(fitted, data=tuple(pieces), solution=replace(fitted.solution, state=carried(fitted, pieces))),
+            )
+            if longer is None or not self.follows(longer):
+                break
+            fitted = longer
+        return fitted
+
+
+def thinned(samples: Samples, order: int) -> Samples:
+    """Leave out samples that a cubic through the others tells to within the noise; not where an input was measured with them."""
+    step = 1
+    levels = 1 if order == 1 or samples.v is None else 2
+    size = noise_of_readings([samples], order, levels)[0]
+    while samples.f is None and np.isfinite(size) and len(samples.t) // (2 * step) >= ENOUGH:
+        if _told(samples, 2 * step) > 1.5 * size:
+            break
+        step *= 2
+    if step == 1:
+        return samples
+    u, v = samples.u[::step], None if samples.v is None else samples.v[::step]
+    return replace(samples, t=samples.t[::step], u=u, v=v)
+
+
+def _told(samples: Samples, step: int) -> float:
+    """RMS of what a cubic spline through every `step`-th sample leaves of the others, in each real part."""
+    from scipy.interpolate import CubicSpline
+
+    left = []
+    for part in np.moveaxis(split_parts(samples.u, samples.is_complex).reshape(len(samples.t), -1), 1, 0):
+        seen = np.isfinite(part)
+        t, value = samples.t[seen], part[seen]
+        if len(t) < 4 * step:
+            return float("inf")
+        left.append(value - CubicSpline(t[::step], value[::step])(t))
+    return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
+
+
+def significant(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Pick what noise alone would hardly do, counting all that was tried; half of the chance is for the catalogue's effects."""
+    found = []
+    for named in (True, False):
+        group = [one for one in findings if one.named is named]
+        found += [one for one in group if one.rarity > np.log(len(group)) - np.log(FALSE_ALARM / 2)]
+    return tuple(sorted(found, key=lambda one: -one.rarity))
+
+
+def _unfitted(findings: Sequence[Finding]) -> list[Candidate]:
+    return [Candidate(one, one.gain, one.evidence, one.p) for one in findings]
+
+
+def _contest(fitted: Fitted, findings: Sequence[Finding], watcher: Watcher) -> list[Candidate]:
+    """Fit the best few effects in full and rank all."""
+    ranking: list[Candidate] = []
+    best, fits = 0.0, 0
+    for one in findings:
+        # Other ends change the motion by more than to first order.
+        near = one.evidence > best - 2 * EQUAL or (one.change.ends is not None and one.evidence > EQUAL)
+        if not one.named or not near or fits >= FULL_FITS:
+            ranking.append(Candidate(one, one.gain, one.evidence, one.p))
+            continue
+        watcher(f"fitting {one.name}")
+        fits += 1
+        with_it = polish(fitted.model.with_change(one.change), fitted)
+        if with_it is None:
+            ranking.append(Candidate(one, 0.0, 0.0, 1.0))
+            continue
+        gain = with_it.gain(fitted)
+        # Of a random effect the evidence is that of its variance: a fit has as many coefficients as there are sites.
+        again = one if one.random or "step" in one.change.psi else replace(one, gain=gain)
+        ranking.append(Candidate(one, gain, again.evidence, again.p, with_it))
+        best = max(best, again.evidence)
+    return sorted(ranking, key=lambda one: -one.evidence)
+
+
+def polish(model: Model, start: Fitted) -> Fitted | None:
+    """Fit a model with its parameters, from the fit of a smaller one; None where it fails."""
+    fitted = refit(model, start.data, start.solution.state)
+    if not np.all(np.isfinite(fitted.solution.state.coefficients)):
+        return None
+    if not any(change.free for change in model.changes):
+        return fitted
+    for _ in range(POLISH):
+        tangent = linearise(fitted)
+        step, error = _joint_step(tangent)
+        changes, errors, begin, largest = [], [], len(fitted.solution.state.coefficients), 0.0
+        for change in fitted.model.changes:
+            free = change.free
+            end = begin + len(free)
+            size = np.array([_longest(change, name, fitted) for name in free])
+            move = np.clip(step[begin:end], -size, size)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                largest = max(
+                    largest, float(np.max(np.nan_to_num(np.abs(step[begin:end]) / error[begin:end]), initial=0.0))
+                )
+            changes.append(
+                change.moved({name: change.psi[name] + float(m) for name, m in zip(free, move, strict=True)})
+            )
+            errors.append(dict(zip(free, (float(e) for e in error[begin:end]), strict=True)))
+            begin = end
+        moved = refit(replace(fitted.model, changes=tuple(changes)), fitted.data, fitted.solution.state)
+        if not np.all(np.isfinite(moved.solution.state.coefficients)):
+            break
+        worse = moved.gain(fitted) < -1.0
+        if worse:
+            break
+        fitted = replace(moved, psi_errors=tuple(errors))
+        if largest < 0.1:
+            break
+    return fitted
+
+
+def settled(fitted: Fitted) -> Fitted:
+    """Write offsets that were found as forces as offsets, where that fits as well."""
+    for number, change in enumerate(fitted.model.changes):
+        if not change.as_force:
+            continue
+        rest = _rest(fitted)
+        if rest is None:
+            continue
+        smaller = _without_coefficients(fitted, number)
+        psi = dict(zip(change.psi, (float(x) for x in rest), strict=True))
+        changes = list(fitted.model.changes)
+        changes[number] = replace(change, as_force=False, psi=psi)
+        other = polish(replace(fitted.model, changes=tuple(changes)), smaller)
+        if other is not None and other.gain(fitted) > -EQUAL:
+            fitted = other
+    return fitted
+
+
+def _rest(fitted: Fitted) -> ndarray | None:
+    """Find the reading of each site at which the equation with the constant forces rests."""
+    from scipy.optimize import root
+
+    record = fitted.records[0]
+    dynamics = record.stretches.dynamics
+    sites, size = dynamics.sites, dynamics.size
+    if dynamics.count != sites:
+        return None
+    start = np.mean(np.concatenate(fitted.solution.state.nodes), axis=0)[:sites]
+    t = record.times[:1]
+
+    def push(u: ndarray) -> ndarray:
+        y = np.concatenate([u, np.zeros(sites)])[None]
+        f = np.zeros((1, sites)) if record.stretches.inputs is not None else None
+        rate = dynamics.linear(fitted.solution.state.coefficients, t, y, f, None, derivatives=False)[0]
+        return np.asarray(rate[0, size - sites :])
+
+    found = root(push, start)
+    return np.asarray(found.x) if found.success else None
+
+
+def _joint_step(tangent: Tangent) -> tuple[ndarray, ndarray]:
+    """Give the Gauss-Newton step of all parameters with their standard errors; random ones are held by their spread."""
+    matrix, target = tangent.jacobian, tangent.raw
+    begin = len(tangent.fitted.solution.state.coefficients)
+    for change in tangent.fitted.model.changes:
+        end = begin + len(change.free)
+        if change.spread is not None and change.free:
+            prior = np.zeros((end - begin, matrix.shape[1]))
+            prior[:, begin:end] = np.eye(end - begin) / change.spread
+            matrix = np.concatenate([matrix, prior])
+            target = np.concatenate([target, -np.array([change.psi[name] for name in change.free]) / change.spread])
+        begin = end
+    length = np.linalg.norm(matrix, axis=0)
+    length[length == 0] = 1.0
+    left, values, right = np.linalg.svd(matrix / length, full_matrices=False)
+    kept = values > 1e-7 * values[0]
+    inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
+    step = right.T @ (inverse * (left.T @ target)) / length
+    error = np.sqrt(np.sum((right.T * inverse) ** 2, axis=1)) / length
+    return step, error
+
+
+def _longest(change: Change, name: str, fitted: Fitted) -> float:
+    """How far a parameter may move in one step."""
+    times = fitted.data[0].t
+    span, gap = float(times[-1] - times[0]), float(np.median(np.diff(times)))
+    limits = {
+        "omega": 0.5 * np.pi / span, "delay": gap, "at": 2 * gap, "width": 0.3 * change.psi.get("width", 1.0), "s": 0.5,
+        "scale": 0.5 * (1 + change.psi.get("scale", 0.0)),
+    }  # fmt: skip
+    return float(limits.get(name, np.inf))
+
+
+def _prune(
+    fitted: Fitted, equal: list[tuple[str, ...]], *, all_of_them: bool = False
+) -> tuple[Fitted, list[tuple[str, ...]]]:
+    """Take away earlier effects that the later ones made superfluous."""
+    number = 0
+    while len(fitted.model.changes) > 1 and number < len(fitted.model.changes) - (not all_of_them):
+        change = fitted.model.changes[number]
+        smaller = polish(fitted.model.without(number), _without_coefficients(fitted, number))
+        columns = max(_columns(change, fitted), 1)
+        if smaller is not None and fitted.gain(smaller) < 2 * columns * np.log(fitted.count) / 2:
+            fitted = smaller
+            equal = equal[:number] + equal[number + 1 :]
+            continue
+        number += 1
+    return fitted, equal
+
+
+def _reconsider(
+    fitted: Fitted,
+    equal: list[tuple[str, ...]],
+    left: tuple[Finding, ...],
+    catalogue: Sequence[Effect],
+    draw: np.random.Generator,
+    surrogates: int,
+    watcher: Watcher,
+) -> tuple[Fitted, list[tuple[str, ...]], tuple[Finding, ...]]:
+    """Look at each effect again, now that the others are in, for another that does better in its place, or as well.
+
+    As long as something is left unexplained, it could tilt the balance by as much as its own evidence.
+    """
+    margin = max(EQUAL, left[0].evidence) if left else EQUAL
+    for number in range(len(fitted.model.changes)):
+        own = fitted.model.changes[number]
+        watcher(f"reconsidering {own.effect.name}")
+        smaller = polish(fitted.model.without(number), _without_coefficients(fitted, number))
+        if smaller is None:
+            continue
+        ranking = _contest(smaller, screen(linearise(smaller), catalogue, draw, surrogates), watcher)
+        tried = [one for one in ranking if one.fitted is not None]
+        if not tried:
+            continue
+        best = tried[0]
+        present = next((one for one in tried if one.name == own.effect.name), None)
+        gain = fitted.gain(smaller)
+        mine = present.evidence if present is not None else replace(best.finding, gain=gain).evidence
+        if (
+            best.name != own.effect.name
+            and best.evidence > mine + margin
+            and best.fitted is not None
+            and best.gain > gain
+        ):
+            # The better one goes to the end, where polish put it.
+            fitted = best.fitted
+            equal = [*equal[:number], *equal[number + 1 :], ()]
+            return fitted, equal, significant(screen(linearise(fitted), catalogue, draw, surrogates))
+        top = max(best.evidence, mine)
+        equal[number] = tuple(one.name for one in tried if one.name != own.effect.name and one.evidence > top - margin)
+    return fitted, equal, left
+
+
+def _columns(change: Change, fitted: Fitted) -> int:
+    samples = fitted.data[0]
+    return len(change.forces(samples.sites, samples.is_complex)) + len(change.free)
+
+
+def _without_coefficients(fitted: Fitted, number: int) -> Fitted:
+    """Take one change's coefficients out of a state."""
+    samples = fitted.data[0]
+    begin = len(fitted.model.declared.terms)
+    for change in fitted.model.changes[:number]:
+        begin += len(change.forces(samples.sites, samples.is_complex))
+    count = len(fitted.model.changes[number].forces(samples.sites, samples.is_complex))
+    state = fitted.solution.state
+    coefficients = np.delete(state.coefficients, np.arange(begin, begin + count))
+    return replace(fitted, solution=replace(fitted.solution, state=replace(state, coefficients=coefficients)))

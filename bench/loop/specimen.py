@@ -1,0 +1,497 @@
+"""Recordings with something in them that the declared equation lacks, to see whether the loop finds it.
+
+They are made apart from the loop: plain NumPy forces beside the system's own right-hand side, SciPy's integrators, and the
+instrument's faults put on afterwards. Sizes are asked for as z, the effect's size over the smallest standard error that it could be
+known with (the Cramer-Rao bound, everything in the declared equation being unknown too): z = 5 is barely visible, 30 plainly.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.loop.model import Fitted, Model, rounding_error
+from bench.loop.tangent import linearise
+from methods.trajectory import Solution, State
+from systems.effects import CATALOGUE, find
+from systems.errors import InputError, unknown
+from systems.lattice import Ends, Motion, System, ghosts, motion
+from systems.samples import Samples, SimulatedSamples
+from systems.simulate import noise_size, sample_times
+from systems.terms import Term, express
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+NONE = "none"
+
+
+@dataclass(frozen=True, eq=False)
+class Specimen:
+    """A recording and what is in it.
+
+    Attributes:
+        samples: with the noise.
+        clean: the same without noise.
+        effect: what the declared equation lacks; "none" for nothing.
+        amount: its coefficient (one complex number where there are two).
+        about: site, frequency and the like.
+        z: its size over the smallest standard error.
+    """
+
+    samples: SimulatedSamples
+    clean: Samples
+    effect: str
+    amount: complex
+    about: Mapping[str, float]
+    z: float
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What is drawn for a specimen, whether its effect needs it or not.
+
+    Attributes:
+        about: single numbers: the `site` (0, ..., N-1), frequency `omega` and `phase` of a drive, middle `at` and `width` of a pulse,
+            `delay`, power `s` of a long-range coupling, and the `middle` of the record.
+        n: place of each site, counted from the chain's middle (N,).
+        far: long-range coupling of the sites (N, N).
+        bond: one bond's force (N, N).
+        each: a number for each site (N,).
+        omegas, phases: of five waves at each site (5, N).
+        late: how late each row is read, in units of the jitter (T,), or None.
+        force: a measured input (T, N), or None.
+    """
+
+    about: Mapping[str, float]
+    n: Float[ndarray, " sites"]
+    far: Float[ndarray, "sites sites"]
+    bond: Float[ndarray, "sites sites"]
+    each: Float[ndarray, " sites"]
+    omegas: Float[ndarray, "waves sites"]
+    phases: Float[ndarray, "waves sites"]
+    late: Float[ndarray, " time"] | None
+    force: Float[ndarray, "time sites"] | None
+
+    @property
+    def site(self) -> int:
+        """The site that something sits at."""
+        return int(self.about["site"])
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A chain at one time.
+
+    Attributes:
+        t: the time.
+        u, v: field and velocity (N,); v is u for order 1.
+        chain: the chain.
+        drawn: places, times and frequencies.
+    """
+
+    t: float
+    u: ndarray
+    v: ndarray
+    chain: Motion
+    drawn: Drawn
+
+    def neighbour(self, k: int) -> ndarray:
+        """Give the field k sites to the right, with what the ends repeat."""
+        u = self.u
+        index, factor = ghosts(len(u), max(-k, 0), max(k, 0), self.chain.ends)
+        begin = max(k, 0)
+        return np.asarray((u[index] * factor)[begin : begin + len(u)])
+
+    def stretch(self, k: int) -> ndarray:
+        """Give the difference to the field k sites to the right."""
+        return np.asarray(self.neighbour(k) - self.u)
+
+    def wave(self) -> float:
+        """Give the drive's harmonic."""
+        about = self.drawn.about
+        return float(np.cos(about["omega"] * self.t + about["phase"]))
+
+    def pulse(self) -> float:
+        """Give the bell-shaped pulse."""
+        about = self.drawn.about
+        return float(np.exp(-(((self.t - about["at"]) / about["width"]) ** 2) / 2))
+
+
+Fields = tuple["ndarray", "ndarray | None"]
+
+
+def _between(m: Moment) -> ndarray:
+    """Give the velocities' second difference."""
+    velocities = replace(m, u=m.v)
+    return np.asarray(velocities.stretch(1) + velocities.stretch(-1))
+
+
+# What pushes the sites, by the catalogue's names.
+PUSHES: dict[str, Callable[[Moment], ndarray]] = {
+    "damping": lambda m: -m.v,
+    "quadratic-drag": lambda m: -np.abs(m.v) * m.v,
+    "dry-friction": lambda m: -np.sign(m.v),
+    "onsite-linear": lambda m: m.u,
+    "onsite-quadratic": lambda m: (np.abs(m.u) if m.chain.is_complex else m.u) * m.u,
+    "onsite-cubic": lambda m: np.abs(m.u) ** 2 * m.u,
+    "onsite-quintic": lambda m: np.abs(m.u) ** 4 * m.u,
+    "constant-force": lambda m: np.ones(len(m.u)),
+    "drive": lambda m: m.wave() * np.ones(len(m.u)),
+    "parametric-drive": lambda m: m.wave() * m.u,
+    "gradient": lambda m: m.drawn.n * (m.u if m.chain.order == 1 else 1),
+    "trap": lambda m: m.drawn.n**2 * m.u,
+    "kick": lambda m: m.pulse() * np.ones(len(m.u)),
+    "next-neighbour": lambda m: m.stretch(2) + m.stretch(-2),
+    "nonlinear-coupling": lambda m: (
+        np.abs(m.stretch(1)) ** 2 * m.stretch(1) + np.abs(m.stretch(-1)) ** 2 * m.stretch(-1)
+    ),
+    "asymmetric-coupling": lambda m: (m.neighbour(1) - m.neighbour(-1)) / 2,
+    "intersite-nonlinearity": lambda m: np.abs(m.u) ** 2 * (m.neighbour(1) + m.neighbour(-1)),
+    "long-range": lambda m: m.drawn.far @ m.u,
+    "nonlinear-loss": lambda m: -(np.abs(m.u) ** 2) * m.u,
+    "gain-loss": lambda m: (-1.0) ** np.arange(len(m.u)) * m.u,
+    "defect": lambda m: np.eye(len(m.u))[m.drawn.site] * m.u,
+    "disorder": lambda m: m.drawn.each * m.u,
+    # Nothing of the catalogue.
+    "other: cubic-drag": lambda m: -(m.v**3),
+    "other: friction-between": _between,
+    "other: drifting-stiffness": lambda m: (m.t - m.drawn.about["middle"]) * m.u,
+    "other: weak-bond": lambda m: m.drawn.bond @ m.u,
+    "other: noise-force": lambda m: np.sum(np.cos(m.drawn.omegas * m.t + m.drawn.phases), axis=0),
+    "other: saturation": lambda m: m.u / (1 + 4 * np.abs(m.u) ** 2) if m.chain.is_complex else np.cos(3 * m.u),
+}
+
+ONLY_SECOND = ("other: cubic-drag", "other: friction-between")
+READINGS = ("sensor-offset", "sensor-gain", "sensor-curve", "clock", "quantisation")
+OTHERS = tuple(name for name in PUSHES if name.startswith("other: "))
+# Effects of complex fields whose size is a real number all the same.
+REAL = ("damping", "nonlinear-loss", "gain-loss", "disorder", "unequal-masses", "ends", *READINGS)
+# Without a size of their own.
+FIXED = ("ends", "quantisation")
+MADE = (NONE, *PUSHES, *READINGS, "ends", "unequal-masses", "known-input", "memory")
+
+
+def sensible(name: str, system: System) -> bool:
+    """Say whether an effect is one that this system's declared equation lacks and that makes sense for it."""
+    if name in OTHERS:
+        return system.order == 2 or name not in ONLY_SECOND
+    effect = find(name)
+    texts = effect.texts(system.order, system.is_complex)
+    if not texts or (name == "known-input" and system.is_complex):
+        return False
+    if effect.acts != "everywhere":
+        return True
+    declared = system.library("equation").terms
+    return any(express(Term(text), declared, system.is_complex) is None for text in texts)
+
+
+def make(
+    system: System,
+    name: str,
+    z: float,
+    draw: np.random.Generator,
+    *,
+    sites: int = 25,
+    samples: int = 50,
+    span: float = 10.0,
+    noise: float = 0.01,
+    velocities: bool = True,
+    variation: bool = False,
+) -> Specimen:
+    """Make a recording with one effect of a size.
+
+    Args:
+        system: its equation is the declared one.
+        name: of the effect: of the catalogue, one of `OTHERS`, or "none"; "a+b" for two that push, each of the size z.
+        z: its size over the smallest standard error.
+        draw: for the places, times and frequencies, the initial state and the noise.
+        sites: N.
+        samples: how many times.
+        span: the time that they are taken in.
+        noise: of u and of v, over the RMS of the field about its mean.
+        velocities: v is observed, too (order 2).
+        variation: the initial state is drawn.
+
+    Raises:
+        InputError: there is no such effect, or no size of it is visible.
+    """
+    for one in name.split("+"):
+        if one in MADE and ("+" not in name or one in PUSHES):
+            continue
+        raise unknown("effect", one, [NONE, *(one.name for one in CATALOGUE), *OTHERS])
+    times = sample_times(samples, span)
+    chain = motion(system, {}, sites)
+    u0, v0 = system.initial_state({}, sites, None, draw if variation else None)
+    start = chain.pack(u0, v0)
+    drawn = _drawn(name, sites, times, draw)
+    plain = _run(chain, start, times, None)
+    sizes = [noise_size(plain[0], noise) / np.sqrt(chain.parts)]
+    if plain[1] is not None and velocities:
+        sizes.append(noise_size(plain[1], noise))
+
+    names = [] if name == NONE else name.split("+")
+    amounts: list[complex] = []
+    (u, v), size = plain, 0.0
+    if names:
+        visible = _measure(system, plain, times, sizes, chain)
+        for one in names:
+            direction: complex = 1.0
+            if system.is_complex and one not in REAL:
+                direction = complex(np.exp(2j * np.pi * draw.uniform()))
+
+            def readings(amount: complex, one: str = one) -> Fields:
+                return _disturbed(one, amount, chain, start, times, drawn)
+
+            if one == "quantisation":
+                amounts.append(_step(plain[0], sizes[0], z))
+            elif one in FIXED:
+                amounts.append(1.0)
+            else:
+                amounts.append(_sized(readings, visible, z, direction, float(np.sqrt(np.mean(np.abs(plain[0]) ** 2)))))
+            u, v = readings(amounts[-1])
+            size = z if one == "quantisation" else visible((u, v))
+        if len(names) > 1:
+            u, v = _run(chain, start, times, _all(names, amounts, chain, drawn))
+    amount = amounts[0] if amounts else 0.0
+    noisy = u + _noise(u, sizes[0], draw)
+    if name == "quantisation":
+        # What is rounded is the noisy reading.
+        noisy = _rounded(noisy, float(np.real(amount)))
+    noisy_v = v + _noise(v, sizes[1], draw) if v is not None and velocities else None
+    clean = Samples(times, u, v, drawn.force, source="exact")
+    observed = SimulatedSamples(
+        times, noisy, noisy_v, drawn.force, sigma=sizes[0] * np.sqrt(chain.parts), source=f"{system.name} with {name}",
+        equation=chain.term.text, exact=clean, noise=noise,
+    )  # fmt: skip
+    return Specimen(observed, clean, name, amount, drawn.about, size)
+
+
+def _sized(
+    clean: Callable[[complex], Fields], visible: Callable[[Fields], float], z: float, direction: complex, scale: float
+) -> complex:
+    """Find the amount that is visible with the size z.
+
+    Raises:
+        InputError: no amount is visible.
+    """
+    trial = 1e-6 * scale
+    for _ in range(6):
+        size = visible(clean(trial * direction))
+        if not size > 0:
+            raise InputError("an effect of no size is visible here")
+        # Large sizes may be far from linear.
+        trial *= float(np.clip(z / size, 0.2, 1e5))
+    return trial * direction
+
+
+def _all(
+    names: Sequence[str], amounts: Sequence[complex], chain: Motion, drawn: Drawn
+) -> Callable[[float, ndarray, ndarray], ndarray]:
+    """Let several effects push at once."""
+
+    def push(t: float, u: ndarray, v: ndarray) -> ndarray:
+        moment = Moment(t, u, v, chain, drawn)
+        return np.asarray(sum(amount * PUSHES[name](moment) for name, amount in zip(names, amounts, strict=True)))
+
+    return push
+
+
+def _rounded(field: ndarray, step: float) -> ndarray:
+    """Round each part to multiples of a step."""
+    if np.iscomplexobj(field):
+        return np.asarray(_rounded(field.real, step) + 1j * _rounded(field.imag, step))
+    return np.asarray(np.round(field / step) * step)
+
+
+def _step(u: ndarray, sigma: float, z: float) -> float:
+    """Give the step whose mean rounding error has the size z beside noise and rounding together."""
+    parts = np.stack([u.real, u.imag]) if np.iscomplexobj(u) else u[None]
+
+    def size(step: float) -> float:
+        wrong = rounding_error(parts, step, sigma, 0.0)
+        return float(np.sqrt(np.sum(wrong**2) / (sigma**2 + step**2 / 12)))
+
+    steps = sigma * np.geomspace(1, 300, 200)
+    return float(next((step for step in steps if size(step) >= z), steps[-1]))
+
+
+def _noise(field: ndarray, sigma: float, draw: np.random.Generator) -> ndarray:
+    """Draw Gaussian noise of this size in each real part."""
+    if np.iscomplexobj(field):
+        return np.asarray(sigma * (draw.normal(size=field.shape) + 1j * draw.normal(size=field.shape)))
+    return np.asarray(sigma * draw.normal(size=field.shape))
+
+
+def _drawn(name: str, sites: int, times: ndarray, draw: np.random.Generator) -> Drawn:
+    """Draw places, times and frequencies."""
+    span = float(times[-1] - times[0])
+    n = np.arange(sites) - (sites - 1) / 2
+    power = draw.uniform(1.5, 3.0)
+    distance = np.abs(n[:, None] - n)
+    far = np.where(distance >= 2, np.maximum(distance, 1.0) ** -power, 0.0)
+    k = int(draw.integers(sites // 3, 2 * sites // 3))
+    bond = np.zeros((sites, sites))
+    bond[k : k + 2, k : k + 2] = [[-1, 1], [1, -1]]
+    omegas = draw.uniform(2 * np.pi / span, 6.0, size=(5, sites))
+    phases = draw.uniform(0, 2 * np.pi, size=(5, sites))
+    about = {
+        "site": int(draw.integers(sites // 4, 3 * sites // 4)),
+        "omega": draw.uniform(1.0, 4.0),
+        "phase": draw.uniform(0, 2 * np.pi),
+        "at": float(times[0]) + span * draw.uniform(0.2, 0.7),
+        "width": span * draw.uniform(0.02, 0.06),
+        "s": power,
+        "middle": float(np.mean(times)),
+    }
+    each = draw.normal(size=sites)
+    about["delay"] = span * draw.uniform(0.08, 0.2)
+    late = draw.normal(size=len(times)) if name == "clock" else None
+    force = None
+    if name == "known-input":
+        force = np.cumsum(draw.normal(size=(len(times), sites)), axis=0)
+        force -= force.mean(axis=0)
+        force /= np.std(force)
+    return Drawn(about, n, far - np.diag(far.sum(axis=1)), bond, each, omegas, phases, late, force)
+
+
+def _run(
+    chain: Motion, start: ndarray, times: ndarray, push: Callable[[float, ndarray, ndarray], ndarray] | None
+) -> Fields:
+    """Integrate the chain with a push, which is given t, u and v (u for order 1)."""
+    from scipy.integrate import solve_ivp
+
+    rate = chain.right_hand_side
+    size = chain.parts * chain.sites
+
+    def forced(t: float, y: ndarray) -> ndarray:
+        change = rate(t, y)
+        if push is not None:
+            u, v = chain.unpack(y)
+            extra = push(t, u, u if v is None else v)
+            change[-size:] += np.concatenate([extra.real, extra.imag]) if chain.is_complex else extra
+        return change
+
+    found = solve_ivp(
+        forced, (times[0], times[-1]), start, t_eval=times, method="DOP853", rtol=1e-9, atol=1e-10,
+        max_step=0.1 * float(times[-1] - times[0]),
+    )  # fmt: skip
+    if found.status != 0 or not np.all(np.isfinite(found.y)):
+        raise InputError("the motion is unbounded")
+    return chain.unpack(found.y)
+
+
+def _disturbed(name: str, amount: complex, chain: Motion, start: ndarray, times: ndarray, drawn: Drawn) -> Fields:
+    """Give the clean readings with an effect of this amount."""
+    if name in PUSHES:
+        function = PUSHES[name]
+        return _run(chain, start, times, lambda t, u, v: amount * function(Moment(t, u, v, chain, drawn)))
+    if name == "unequal-masses":
+        return _run(chain, start, times, _scaled(chain, drawn.site, float(np.real(amount))))
+    if name == "known-input":
+        from scipy.interpolate import CubicSpline
+
+        force = CubicSpline(times, drawn.force)
+        return _run(chain, start, times, lambda t, _u, _v: amount * force(t))
+    if name == "memory":
+        return _with_memory(amount, chain, start, times, float(drawn.about["delay"]))
+    if name == "ends":
+        other: Ends = "fixed" if chain.ends == "free" else "free"
+        return _run(replace(chain, ends=other), start, times, None)
+    if name == "clock":
+        assert drawn.late is not None
+        return _read_late(chain, start, times, float(np.real(amount)) * drawn.late)
+    return _misread(name, float(np.real(amount)), drawn.site, *_run(chain, start, times, None))
+
+
+def _scaled(chain: Motion, site: int, amount: float) -> Callable[[float, ndarray, ndarray], ndarray]:
+    """Make the push that scales one site's whole right-hand side by 1 + amount."""
+    rate, size = chain.right_hand_side, chain.parts * chain.sites
+
+    def push(t: float, u: ndarray, v: ndarray) -> ndarray:
+        own = rate(t, chain.pack(u, v))[-size:]
+        whole = own[: chain.sites] + 1j * own[chain.sites :] if chain.is_complex else own
+        return np.asarray(amount * np.eye(chain.sites)[site] * whole)
+
+    return push
+
+
+def _misread(name: str, size: float, site: int, u: ndarray, v: ndarray | None) -> Fields:
+    """Give what a sensor that lies shows of a field; rounding comes after the noise."""
+    one = np.eye(u.shape[1])[site]
+    if name == "sensor-offset":
+        return u + size * one, v
+    if name == "sensor-gain":
+        return u * (1 + size * one), None if v is None else v * (1 + size * one)
+    if name == "sensor-curve":
+        bent = u + size * (np.abs(u) if np.iscomplexobj(u) else u) * u
+        return bent, None if v is None else v * (1 + 2 * size * u)
+    return u, v
+
+
+def _read_late(chain: Motion, start: ndarray, times: ndarray, late: ndarray) -> Fields:
+    """Give the field as it is when each row is read a little late or early, within the record."""
+    at = np.clip(times + late, times[0], times[-1])
+    grid, place = np.unique(np.concatenate([times[[0, -1]], at]), return_inverse=True)
+    u, v = _run(chain, start, grid, None)
+    rows = place[2:]
+    return u[rows], None if v is None else v[rows]
+
+
+def _always(field: ndarray, _: float) -> ndarray:
+    return field
+
+
+def _with_memory(amount: complex, chain: Motion, start: ndarray, times: ndarray, delay: float) -> Fields:
+    """Integrate in steps of one delay: within one, the past is known. Before the start the field was what it was then."""
+    from scipy.interpolate import CubicSpline
+
+    rows: dict[float, ndarray] = {}
+    past: Callable[[float], ndarray] = functools.partial(_always, chain.unpack(start)[0])
+    y = start
+    for begin, end in itertools.pairwise(np.append(np.arange(times[0], times[-1], delay), times[-1])):
+        grid = np.unique(np.concatenate([np.linspace(begin, end, 60), times[(times >= begin) & (times <= end)]]))
+
+        def push(t: float, _u: ndarray, _v: ndarray, past: Callable[[float], ndarray] = past) -> ndarray:
+            return np.asarray(amount * past(t - delay))
+
+        u, v = _run(chain, y, grid, push)
+        for k, t in enumerate(grid):
+            rows[float(t)] = chain.pack(u[k], None if v is None else v[k])
+        y = rows[float(grid[-1])]
+        past = CubicSpline(grid, u)
+    return chain.unpack(np.stack([rows[float(t)] for t in times], axis=1))
+
+
+def _measure(
+    system: System, plain: Fields, times: ndarray, sizes: list[float], chain: Motion
+) -> Callable[[Fields], float]:
+    """Make the function that says how visible a change of the readings is beside the declared equation's unknowns."""
+    declared = system.library("equation")
+    truth = system.truth(declared, {})
+    assert truth is not None
+    u, v = plain
+    samples = Samples(times, u, v if len(sizes) > 1 else None, ends=system.ends)
+    model = Model(declared, system.order)
+    records = model.records([samples])
+    nodes = records[0].stretches.dynamics.pack(u, v)
+    sigma = np.array(sizes)
+    covariance, counts = np.eye(len(truth)), np.ones(len(sizes))
+    solution = Solution(State(truth, (nodes,), (None,)), sigma, covariance, sigma**2, counts, 1, True, ())
+    tangent = linearise(Fitted(model, (samples,), tuple(records), solution))
+    path = tangent.paths[0]
+
+    def visible(found: Fields) -> float:
+        changes = [
+            one - exact for one, exact in zip(found, plain, strict=True) if one is not None and exact is not None
+        ]
+        levels = [np.stack([f.real, f.imag] if chain.is_complex else [f], axis=1) for f in changes[: len(sizes)]]
+        return float(np.linalg.norm(tangent.new(path.free(path.rows(np.stack(levels, axis=1)[None])))))
+
+    return visible

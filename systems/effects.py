@@ -1,0 +1,279 @@
+"""The catalogue: pieces of physics and of measurement that a declared equation may lack.
+
+Each effect has a formula in the term language, a way of acting (a term at every site, at one site, in time; other ends; a sensor
+that does not show the field as it is), what to look for, and a source. Coefficients have no size here: data give them.
+
+A user's own catalogue is a TOML file with a table `[[effect]]` for each:
+
+    [[effect]]
+    name = "cubic-drag"
+    formula = "v[n]**3"
+    orders = [2]
+    look_for = "amplitudes that fall as one over the root of time"
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal, get_args
+
+from systems.errors import InputError, unknown
+from systems.terms import TermError, check
+
+Acts = Literal[
+    "everywhere", "harmonic", "pulse", "delayed", "long range", "alternating", "one site", "one equation", "every site",
+    "ends", "offset", "gain", "curve", "clock", "rounding",
+]  # fmt: skip
+"""How an effect acts.
+
+- everywhere: the formula, at every site and time;
+- harmonic: times cos(omega t) and sin(omega t), omega found;
+- pulse: times exp(-((t - at) / width)^2 / 2), at and width found;
+- delayed: of the field as it was `delay` before, delay found;
+- long range: sum over r >= 2 of (u_{n+r} + u_{n-r} - 2 u_n) / r^s, s found;
+- alternating: with the sign (-1)^k at site k;
+- one site: at one site only, the site found; every site: at each with a coefficient of its own;
+- one equation: the whole right-hand side of one site is scaled;
+- ends: the chain ends otherwise than declared;
+- offset, gain, curve, clock, rounding: of the instrument: y = u + b, g u, u + c u^2; the times are not what they are said
+  to be; y is a multiple of a step.
+"""
+
+INSTRUMENT: tuple[Acts, ...] = ("offset", "gain", "curve", "clock", "rounding")
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One entry of the catalogue.
+
+    Attributes:
+        name: what it is called.
+        formula: in the term language, for a second-order lattice and wherever the next two are None.
+        first_order: for a first-order lattice; "" where it makes no sense there.
+        complex_field: for a complex field; "" where it makes no sense there.
+        acts: how, see `Acts`.
+        real: for complex fields, the coefficient is real; otherwise it is complex: two real ones, of T and i*T.
+        orders: of the time derivative that it makes sense for.
+        look_for: what gives it away.
+        source: where to read about it.
+
+    Raises:
+        InputError: the name or a formula is unsound.
+    """
+
+    name: str
+    formula: str
+    acts: Acts = "everywhere"
+    first_order: str | None = None
+    complex_field: str | None = None
+    real: bool = False
+    orders: tuple[int, ...] = (1, 2)
+    look_for: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Check every text."""
+        if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", self.name):
+            raise InputError(
+                f"effect {self.name!r}: a name is small letters, digits and single dashes, such as dry-friction"
+            )
+        if self.acts not in get_args(Acts):
+            raise unknown("way of acting", str(self.acts), get_args(Acts), f"effect {self.name!r}")
+        if not (self.formula or self.first_order or self.complex_field):
+            raise InputError(f"effect {self.name!r}: it has no formula")
+        for text in (self.formula, self.first_order, self.complex_field):
+            if text:
+                try:
+                    check(text)
+                except TermError as error:
+                    raise InputError(f"effect {self.name!r}: {error}") from None
+
+    def texts(self, order: int, is_complex: bool) -> tuple[str, ...]:
+        """Give the terms for a lattice: one, or T and i*T where the coefficient is complex; none where it makes no sense."""
+        if order not in self.orders:
+            return ()
+        text = self.formula
+        if is_complex and self.complex_field is not None:
+            text = self.complex_field
+        elif order == 1 and self.first_order is not None:
+            text = self.first_order
+        if not text:
+            return ()
+        return (
+            (text, f"i*({text})" if "+" in text or "-" in text else f"i*{text}")
+            if is_complex and not self.real
+            else (text,)
+        )
+
+
+def find(name: str, catalogue: tuple[Effect, ...] | None = None) -> Effect:
+    """Look an effect up by its name.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    for effect in catalogue or CATALOGUE:
+        if effect.name == name:
+            return effect
+    raise unknown("effect", name, [effect.name for effect in catalogue or CATALOGUE])
+
+
+def load(path: Path) -> tuple[Effect, ...]:
+    """Read a user's own effects from a TOML file.
+
+    Raises:
+        InputError: the file is missing or an entry is unsound; the text names the file and the entry.
+    """
+    from systems.toml import read_toml
+
+    content = read_toml(path)
+    for key in content:
+        if key != "effect":
+            raise unknown("key", key, ["effect"], str(path))
+    entries = content.get("effect")
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{path}: give at least one table [[effect]] with a name and a formula")
+    known = [one.name for one in fields(Effect)]
+    found = []
+    for number, entry in enumerate(entries, start=1):
+        where = f"{path}: effect {number}"
+        if not isinstance(entry, dict):
+            raise InputError(f"{where}: it is {entry!r}; it must be a table [[effect]]")
+        for key in entry:
+            if key not in known:
+                raise unknown("key", key, known, where)
+        for key in ("name", "formula"):
+            if not isinstance(entry.get(key), str):
+                raise InputError(f"{where}: the key {key!r} is missing or is no text")
+        orders = entry.get("orders", [1, 2])
+        if (
+            not isinstance(orders, list)
+            or not orders
+            or any(type(one) is not int or one not in (1, 2) for one in orders)
+        ):
+            raise InputError(f"{where}: orders is {orders!r}; it must be a list of 1 and 2")
+        for key, value in entry.items():
+            wanted = bool if key == "real" else list if key == "orders" else str
+            if not isinstance(value, wanted):
+                raise InputError(f"{where}: {key} is {value!r}; it must be a {wanted.__name__}")
+        try:
+            found.append(Effect(**{**entry, "orders": tuple(orders)}))
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+    names = [effect.name for effect in (*CATALOGUE, *found)]
+    for effect in found:
+        if names.count(effect.name) > 1:
+            raise InputError(f"{path}: there are two effects called {effect.name!r}")
+    return tuple(found)
+
+
+NAYFEH = "Nayfeh & Mook, Nonlinear Oscillations (1979)"
+BRAUN = "Braun & Kivshar, The Frenkel-Kontorova Model (2004)"
+KEVREKIDIS = "Kevrekidis, The Discrete Nonlinear Schroedinger Equation (2009)"
+ARANSON = "Aranson & Kramer, Rev. Mod. Phys. 74, 99 (2002)"
+LJUNG = "Ljung, System Identification (1999)"
+
+CATALOGUE: tuple[Effect, ...] = (
+    # Motion.
+    Effect(
+        "damping", "v[n]", first_order="u[n]", real=True,
+        look_for="amplitudes that fall exponentially, alike at all sizes", source=NAYFEH,
+    ),
+    Effect(
+        "quadratic-drag", "abs(v[n])*v[n]", orders=(2,),
+        look_for="large swings fall faster than small ones, as one over time", source=NAYFEH,
+    ),
+    Effect(
+        "dry-friction", "sign(v[n])", orders=(2,),
+        look_for="amplitudes that fall along a straight line, to a stop", source=NAYFEH,
+    ),
+    Effect(
+        "onsite-linear", "u[n]",
+        look_for="one frequency shift for all sizes and wavelengths", source=BRAUN,
+    ),
+    Effect(
+        "onsite-quadratic", "u[n]**2", complex_field="abs(u[n])*u[n]",
+        look_for="swings that reach farther to one side", source=NAYFEH,
+    ),
+    Effect(
+        "onsite-cubic", "u[n]**3", complex_field="abs(u[n])**2*u[n]",
+        look_for="a frequency that moves with the square of the size", source=NAYFEH,
+    ),
+    Effect(
+        "onsite-quintic", "u[n]**5", complex_field="abs(u[n])**4*u[n]",
+        look_for="a frequency that moves with the fourth power of the size", source=KEVREKIDIS,
+    ),
+    Effect("constant-force", "1", look_for="a rest state moved the same way everywhere", source=BRAUN),
+    Effect(
+        "drive", "1", acts="harmonic",
+        look_for="one line in the spectrum of the residual, in step at all sites", source=NAYFEH,
+    ),
+    Effect(
+        "parametric-drive", "u[n]", acts="harmonic",
+        look_for="lines at the sum and difference of a frequency and the motion's own", source=NAYFEH,
+    ),
+    Effect("known-input", "f[n]", look_for="a residual that follows the measured input", source=LJUNG),
+    Effect(
+        "gradient", "n", first_order="n*u[n]", complex_field="n*u[n]",
+        look_for="sites pushed, or turning in phase, in proportion to their place", source=KEVREKIDIS,
+    ),
+    Effect(
+        "trap", "n**2*u[n]",
+        look_for="the ends stiffer, or turning faster in phase, than the middle", source=KEVREKIDIS,
+    ),
+    Effect("memory", "u[n]", acts="delayed", look_for="a residual that follows the field with a lag", source=LJUNG),
+    Effect("kick", "1", acts="pulse", look_for="a residual that begins at one time, at all sites", source=NAYFEH),
+    # Coupling.
+    Effect(
+        "next-neighbour", "u[n+2]+u[n-2]-2*u[n]",
+        look_for="short waves off by more than long ones, alike at all sizes", source=BRAUN,
+    ),
+    Effect(
+        "nonlinear-coupling", "(u[n+1]-u[n])**3+(u[n-1]-u[n])**3",
+        complex_field="abs(u[n+1]-u[n])**2*(u[n+1]-u[n])+abs(u[n-1]-u[n])**2*(u[n-1]-u[n])",
+        look_for="a residual where neighbours differ most", source="Flach & Gorbach, Phys. Rep. 467, 1 (2008)",
+    ),
+    Effect(
+        "asymmetric-coupling", "(u[n+1]-u[n-1])/2",
+        look_for="waves to the right and to the left that differ", source="Hatano & Nelson, Phys. Rev. Lett. 77, 570 (1996)",
+    ),
+    Effect(
+        "intersite-nonlinearity", "", complex_field="abs(u[n])**2*(u[n+1]+u[n-1])",
+        look_for="coupling that grows with the size", source=KEVREKIDIS,
+    ),
+    Effect(
+        "long-range", "u[n]", acts="long range",
+        look_for="far sites that answer at once", source="Gaididei et al., Phys. Rev. E 55, 6141 (1997)",
+    ),
+    # Complex fields.
+    Effect(
+        "nonlinear-loss", "", complex_field="abs(u[n])**2*u[n]", real=True,
+        look_for="a norm that falls fastest where it is large", source=ARANSON,
+    ),
+    Effect(
+        "gain-loss", "", complex_field="u[n]", acts="alternating", real=True,
+        look_for="neighbours of which one grows and one fades", source="Konotop et al., Rev. Mod. Phys. 88, 035002 (2016)",
+    ),
+    # Places.
+    Effect("defect", "u[n]", acts="one site", look_for="a residual at one site and its neighbours", source=BRAUN),
+    Effect(
+        "unequal-masses", "u[n]", acts="one equation",
+        look_for="one site that answers all forces too much or too little", source=BRAUN,
+    ),
+    Effect("ends", "u[n]", acts="ends", look_for="a residual that starts at the ends and travels inward", source="this project"),
+    Effect(
+        "disorder", "u[n]", acts="every site",
+        look_for="a residual of each site's own", source="Anderson, Phys. Rev. 109, 1492 (1958)",
+    ),
+    # The instrument.
+    Effect("sensor-offset", "1", acts="offset", look_for="a residual that does not change in time", source=LJUNG),
+    Effect("sensor-gain", "u[n]", acts="gain", look_for="a residual in proportion to one site's reading", source=LJUNG),
+    Effect("sensor-curve", "u[n]**2", complex_field="abs(u[n])*u[n]", acts="curve", look_for="a residual in proportion to the square of the reading", source=LJUNG),
+    Effect("clock", "v[n]", acts="clock", look_for="a residual in proportion to the velocity, at all sites at once", source=LJUNG),
+    Effect(
+        "quantisation", "u[n]", acts="rounding",
+        look_for="readings that are multiples of a step", source="Widrow & Kollar, Quantization Noise (2008)",
+    ),
+)  # fmt: skip

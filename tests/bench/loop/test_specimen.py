@@ -1,0 +1,238 @@
+"""Specimens: of the size that was asked for, the same from the same draws, and made by nothing that the loop uses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import systems
+from bench.loop.model import Model, first_fit
+from bench.loop.specimen import FIXED, MADE, NONE, OTHERS, make, sensible
+from systems.effects import CATALOGUE
+from systems.errors import InputError
+from systems.lattice import library
+from systems.samples import Samples
+from systems.sensitivity import Dynamics
+
+SMALL = {"sites": 7, "samples": 25, "span": 5.0}
+NAMES = ["phi4", "sine-gordon", "dnls", "ginzburg-landau"]
+EVERY = [
+    (name, effect)
+    for name in ("phi4", "dnls")
+    for effect in MADE
+    if effect != NONE and sensible(effect, systems.find(name))
+]
+
+
+def drawn(name, effect, z=15, seed=2, **options):
+    return make(systems.find(name), effect, z, np.random.default_rng(seed), **{**SMALL, "variation": True, **options})
+
+
+@pytest.mark.parametrize(("name", "effect"), EVERY)
+def test_an_effect_is_as_visible_as_was_asked_for(name, effect):
+    one = drawn(name, effect)
+    if effect in FIXED:
+        assert one.z > 0
+    else:
+        assert one.z == pytest.approx(15, rel=0.02)
+        assert one.amount != 0
+    assert one.effect == effect
+
+
+def test_other_ends_and_rounding_are_as_large_as_they_are():
+    assert drawn("phi4", "ends").amount == 1
+    step = drawn("phi4", "quantisation").amount
+    shown = drawn("phi4", "quantisation").samples.u / step
+    np.testing.assert_allclose(shown, np.round(shown), atol=1e-9)
+    # What is rounded is u, and v not.
+    other = drawn("phi4", "quantisation").samples.v / step
+    assert np.max(np.abs(other - np.round(other))) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "effect", "terms", "column"),
+    [
+        ("phi4", "damping", ["u[n+1]+u[n-1]-2*u[n]", "u[n]", "u[n]**3", "v[n]"], -1),
+        ("phi4", "gradient", ["u[n+1]+u[n-1]-2*u[n]", "u[n]", "u[n]**3", "n"], 1),
+        ("sine-gordon", "trap", ["u[n+1]+u[n-1]-2*u[n]", "sin(u[n])", "n**2*u[n]"], 1),
+    ],
+)
+def test_its_size_is_the_coefficient_over_the_standard_error_of_a_fit(name, effect, terms, column):
+    one = drawn(name, effect, z=12, noise=0.002)
+    found = first_fit(Model(library("true", terms), 2), [replace(one.samples.observed(), ends="free")])
+    error = np.sqrt(np.diag(found.solution.covariance))[-1]
+    assert column * np.real(one.amount) / error == pytest.approx(12, rel=0.25)
+
+
+@pytest.mark.parametrize(("name", "effect"), EVERY)
+def test_the_same_generator_gives_the_same_specimen(name, effect):
+    one, other, third = drawn(name, effect), drawn(name, effect), drawn(name, effect, seed=3)
+    assert np.array_equal(one.samples.u, other.samples.u)
+    assert one.samples.v is None or np.array_equal(one.samples.v, other.samples.v)
+    assert one.about == other.about
+    assert one.amount == other.amount
+    assert not np.array_equal(one.samples.u, third.samples.u)
+
+
+def test_nothing_in_it_is_the_systems_own_motion_with_noise():
+    system = systems.find("phi4")
+    one = drawn("phi4", NONE, noise=0.02)
+    rms = np.sqrt(np.mean((one.clean.u - np.mean(one.clean.u)) ** 2))
+    left = (one.samples.u - one.clean.u) / (0.02 * rms)
+    assert np.std(left) == pytest.approx(1, abs=0.2)
+    assert one.amount == one.z == 0
+    assert one.samples.sigma == pytest.approx(0.02 * rms)
+    assert one.samples.u.shape == one.samples.v.shape == (25, 7)
+    assert drawn("phi4", NONE, velocities=False).samples.v is None
+    assert system.is_complex is False
+
+
+# Not by the loop's own dynamics -----------------------------------------------------------------------------------------------
+
+
+def neighbours(u):
+    """Sum of the neighbours at free ends, where u_0 = u_1."""
+    return np.concatenate([u[1:], u[-1:]]) + np.concatenate([u[:1], u[:-1]])
+
+
+def phi4(extra):
+    def rate(t, y):
+        u, v = np.split(y, 2)
+        return np.concatenate([v, 2 * (neighbours(u) - 2 * u) + 2 * (u - u**3) + extra(t, u, v)])
+
+    return rate
+
+
+def coupling_of(name):
+    """The declared coupling, read off the true coefficients."""
+    system = systems.find(name)
+    return system.truth(system.library("equation"), {})
+
+
+@pytest.mark.parametrize("effect", ["damping", "drive", "defect", "next-neighbour", "unequal-masses", "gradient"])
+def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
+    one = drawn("phi4", effect, z=40, noise=0.05)
+    amount, about = np.real(one.amount), one.about
+    xi = coupling_of("phi4")
+    n = np.arange(7) - 3.0
+    at = np.eye(7)[int(about["site"])]
+
+    def own(u):
+        return xi[0] * (neighbours(u) - 2 * u) + xi[1] * u + xi[2] * u**3
+
+    def far(u):
+        right, left = np.concatenate([u[2:], u[-1:-3:-1]]), np.concatenate([u[1::-1], u[:-2]])
+        return right + left - 2 * u
+
+    extras = {
+        "damping": lambda _t, _u, v: -v,
+        "drive": lambda t, u, _v: np.cos(about["omega"] * t + about["phase"]) + 0 * u,
+        "defect": lambda _t, u, _v: at * u,
+        "next-neighbour": lambda _t, u, _v: far(u),
+        "unequal-masses": lambda _t, u, _v: at * own(u),
+        "gradient": lambda _t, u, _v: n + 0 * u,
+    }
+
+    def rate(t, y):
+        u, v = np.split(y, 2)
+        return np.concatenate([v, own(u) + amount * extras[effect](t, u, v)])
+
+    t, start = one.clean.t, np.concatenate([one.clean.u[0], one.clean.v[0]])
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(one.clean.u, y[:, :7], atol=1e-6)
+    np.testing.assert_allclose(one.clean.v, y[:, 7:], atol=1e-6)
+
+
+@pytest.mark.parametrize(("effect", "turn"), [("nonlinear-loss", -1), ("asymmetric-coupling", 1)])
+def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
+    one = drawn("dnls", effect, z=40, noise=0.05)
+    coupling, cubic = (-1j * np.array([1j, 1j]) * coupling_of("dnls")).real
+    right = systems.find("dnls").library("equation").texts
+    assert [text.startswith("i*") for text in right] == [True, True]
+
+    def rate(_, u):
+        beside = neighbours(u)
+        extra = (
+            abs(u) ** 2 * u if effect == "nonlinear-loss" else (np.append(u[1:], u[-1]) - np.append(u[0], u[:-1])) / 2
+        )
+        return 1j * coupling * (beside - 2 * u) + 1j * cubic * abs(u) ** 2 * u + turn * one.amount * extra
+
+    t = one.clean.t
+    u = solve_ivp(
+        rate, t[[0, -1]], one.clean.u[0].astype(complex), t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11
+    ).y.T
+    np.testing.assert_allclose(one.clean.u, u, atol=1e-6)
+
+
+def test_the_field_remembers_what_it_was_a_delay_ago():
+    one = drawn("phi4", "memory", z=60, noise=0.05, samples=400)
+    t, delay, amount = one.clean.t, one.about["delay"], np.real(one.amount)
+    xi = coupling_of("phi4")
+    u = one.clean.u
+    # The acceleration by differences of the velocity, against the force of the field as it was.
+    inside = slice(1, -1)
+    acceleration = (one.clean.v[2:] - one.clean.v[:-2]) / (t[2:] - t[:-2])[:, None]
+    own = np.array([xi[0] * (neighbours(row) - 2 * row) + xi[1] * row + xi[2] * row**3 for row in u])[inside]
+    past = np.stack([np.interp(t[inside] - delay, t, column) for column in u.T], axis=1)
+    left = acceleration - own
+    slope = np.sum(left * past) / np.sum(past**2)
+    assert slope == pytest.approx(amount, rel=0.02)
+    assert np.std(left - amount * past) < 0.05 * np.std(left)
+
+
+def test_making_one_does_not_call_the_dynamics_that_fits_use(monkeypatch):
+    """But for the size, which is measured on the plain motion, everything is made without it."""
+    from bench.loop import specimen
+
+    def forbidden(*_, **__):
+        raise AssertionError("the loop's dynamics was used")
+
+    monkeypatch.setattr(specimen, "_measure", lambda *_: lambda found: 15 * float(np.max(np.abs(found[0])) > 0))
+    monkeypatch.setattr(Dynamics, "linear", forbidden)
+    for name, effect in EVERY:
+        drawn(name, effect)
+
+
+def test_jitter_moves_rows_by_times_that_differ():
+    one = drawn("phi4", "clock", z=40)
+    plain = drawn("phi4", NONE)
+    moved = one.clean.u - plain.clean.u
+    late = np.sum(moved * plain.clean.v, axis=1) / np.sum(plain.clean.v**2, axis=1)
+    assert np.std(late) > 3 * abs(np.mean(late)) / np.sqrt(len(late))
+    assert np.array_equal(one.samples.t, plain.samples.t)
+
+
+# What makes sense ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_the_equation_has_already_is_no_effect_of_it(name):
+    system = systems.find(name)
+    lacking = {effect.name for effect in CATALOGUE if sensible(effect.name, system)}
+    has = {"phi4": {"onsite-linear", "onsite-cubic"}, "sine-gordon": set(), "dnls": set()}
+    assert not lacking & has.get(name, {"onsite-linear", "onsite-cubic", "damping", "nonlinear-loss"})
+    assert {"drive", "defect", "ends", "sensor-offset", "clock", "disorder"} <= lacking
+    if not system.is_complex:
+        assert not lacking & {"nonlinear-loss", "gain-loss", "intersite-nonlinearity"}
+    if system.order == 1:
+        assert not lacking & {"dry-friction", "quadratic-drag"}
+    assert {other for other in OTHERS if sensible(other, system)} >= {"other: weak-bond", "other: saturation"}
+
+
+def test_every_effect_of_the_catalogue_can_be_made():
+    assert {one.name for one in CATALOGUE} <= set(MADE)
+
+
+def test_an_unknown_effect_is_refused_by_name():
+    with pytest.raises(InputError, match="dampng"):
+        drawn("phi4", "dampng")
+    with pytest.raises(InputError):
+        sensible("dampng", systems.find("phi4"))
+
+
+def test_an_effect_that_does_nothing_is_refused():
+    with pytest.raises(InputError, match="of no size is visible"):
+        drawn("phi4", "onsite-linear")

@@ -1,0 +1,189 @@
+"""The command `latticebench diagnose`, as a user types it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import systems
+from bench import cli
+from bench.loop.specimen import make
+from systems.samples import Samples, read, write
+
+SYSTEM = """
+name = "mine"
+equation = "u[n+1]-u[n]"
+order = 2
+[initials.rest]
+u = "0"
+[libraries]
+some = "u[n+1]; u[n]"
+"""
+OWN = """
+[[effect]]
+name = "cubic-drag"
+formula = "v[n]**3"
+orders = [2]
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A damped phi^4 lattice, a later recording of it, and files that do not fit."""
+    place = tmp_path_factory.mktemp("diagnose")
+    specimen = make(systems.find("phi4"), "damping", 30, np.random.default_rng(3), sites=9, samples=40)
+    write([specimen.samples], place / "damped.csv")
+    samples = specimen.samples
+    assert samples.v is not None
+    write([Samples(samples.t[20:], samples.u[20:], samples.v[20:])], place / "later.csv")
+    write([Samples(samples.t, samples.u[:, :4], samples.v[:, :4])], place / "short.csv")
+    write([Samples(samples.t[:2], samples.u[:2])], place / "two-rows.csv")
+    (place / "mine.toml").write_text(SYSTEM)
+    (place / "own.toml").write_text(OWN)
+    (place / "own-bad.toml").write_text(OWN + "size = 3\n")
+    text = (place / "damped.csv").read_text().splitlines()
+    text[4] = text[4].replace(text[4].split(",")[2], "seven", 1)
+    (place / "bad.csv").write_text("\n".join(text) + "\n")
+    return place
+
+
+@pytest.fixture
+def typed(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+    """Type a command in the folder and give exit code, standard output and standard error."""
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", ["latticebench", *arguments])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        shown = capsys.readouterr()
+        return int(end.value.code or 0), shown.out, shown.err
+
+    return run
+
+
+def test_a_diagnosis_names_the_effect_and_writes_json_and_a_page(typed, folder: Path) -> None:  # type: ignore[no-untyped-def]
+    code, out, err = typed(
+        "diagnose",
+        "damped.csv",
+        "--system",
+        "phi4",
+        "--effects",
+        "own.toml",
+        "--json",
+        "out/found.json",
+        "--html",
+        "out/found.html",
+    )
+    assert (code, err) == (0, "")
+    assert out.startswith("What the equation lacks: ")
+    found = json.loads((folder / "out" / "found.json").read_text())
+    assert found["verdict"] == "explained"
+    assert "damping" in {found["effects"][0]["effect"], *found["effects"][0]["indistinguishable"]}
+    assert "cubic-drag" in {entry["effect"] for entry in found["rounds"][0]["ranking"]}
+    assert list(found["declared"]) == ["u[n+1]+u[n-1]-2*u[n]", "u[n]", "u[n]**3"]
+    page = (folder / "out" / "found.html").read_text()
+    assert "damped.csv" in page
+    assert "latticebench diagnose" in page
+
+
+def test_json_to_the_screen_is_nothing_but_json_and_depends_on_the_seed_alone(typed) -> None:  # type: ignore[no-untyped-def]
+    terms = "u[n+1]+u[n-1]-2*u[n]; u[n]; u[n]**3"
+    first, second = (
+        typed(
+            "diagnose", "damped.csv", "--terms", terms, "--order", "2", "--ends", "free", "--json", "-", "--seed", "3"
+        )
+        for _ in range(2)
+    )
+    assert first == second
+    assert json.loads(first[1])["verdict"] == "explained"
+
+
+def test_ends_that_are_not_told_are_unknown_with_terms_and_the_systems_own_with_a_system(typed) -> None:  # type: ignore[no-untyped-def]
+    terms = "u[n+1]+u[n-1]-2*u[n]; u[n]; u[n]**3"
+    _, out, _ = typed("diagnose", "damped.csv", "--terms", terms, "--order", "2", "--json", "-")
+    assert any("ends were not declared" in note for note in json.loads(out)["notes"])
+    _, out, _ = typed("diagnose", "damped.csv", "--system", "phi4", "--json", "-")
+    assert not any("ends were not declared" in note for note in json.loads(out)["notes"])
+
+
+def test_forecasts_are_judged_on_the_file_that_is_held_out(typed) -> None:  # type: ignore[no-untyped-def]
+    _, own, _ = typed("diagnose", "damped.csv", "--system", "phi4", "--json", "-")
+    code, held, err = typed("diagnose", "damped.csv", "--system", "phi4", "--holdout", "later.csv", "--json", "-")
+    assert (code, err) == (0, "")
+    own, held = json.loads(own), json.loads(held)
+    assert held["declared"] == own["declared"]
+    assert held["error"]["forecast"] != own["error"]["forecast"]
+    assert 0 < held["error"]["forecast"]["after"] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nothing.csv", "--system", "phi4"], "nothing.csv: no such file"),
+        (["bad.csv", "--system", "phi4"], "bad.csv: row 4, column u2: "),
+        (["damped.csv"], "give --system, or --terms and --order"),
+        (["damped.csv", "--system", "phi4", "--terms", "u[n]"], "give --system, or --terms and --order"),
+        (["damped.csv", "--terms", "u[n]"], "--order: 1 for du/dt"),
+        (["damped.csv", "--terms", "u[n]; whatever", "--order", "2"], "unknown name 'whatever'"),
+        (["damped.csv", "--terms", "u[n]; f[n]", "--order", "2"], "damped.csv: the library uses f[n]"),
+        (["damped.csv", "--terms", "v[n]", "--order", "1"], "order 1 has no velocity"),
+        (["damped.csv", "--system", "fi4"], "unknown system 'fi4'"),
+        (["damped.csv", "--system", "mine.toml"], "mine.toml: it has no library 'equation'"),
+        (["damped.csv", "--system", "dnls"], "damped.csv: the library uses i, but the field is real"),
+        (["damped.csv", "--system", "phi4", "--ends", "loose"], "--ends"),
+        (["damped.csv", "--system", "phi4", "--effects", "none.toml"], "none.toml"),
+        (["damped.csv", "--system", "phi4", "--effects", "own-bad.toml"], "own-bad.toml: effect 1: unknown key 'size'"),
+        (["damped.csv", "--system", "phi4", "--holdout", "short.csv"], "short.csv: it has 4 sites, damped.csv has 9"),
+        (["damped.csv", "--system", "phi4", "--seed", "-1"], "--seed"),
+        (["damped.csv", "--system", "phi4", "--method", "guess"], "--method"),
+    ],
+)
+def test_bad_input_is_one_line_that_says_where(typed, arguments: list[str], words: str) -> None:  # type: ignore[no-untyped-def]
+    code, out, err = typed("diagnose", *arguments)
+    assert code == 2
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert words in err
+
+
+def test_too_few_rows_are_refused_in_one_line_or_diagnosed(typed) -> None:  # type: ignore[no-untyped-def]
+    code, _, err = typed("diagnose", "two-rows.csv", "--system", "phi4")
+    assert code in (0, 2)
+    assert code == 0 or (err.startswith("error: two-rows.csv: ") and err.count("\n") == 1)
+
+
+def test_a_result_that_cannot_be_written_leaves_what_was_there(typed, folder: Path) -> None:  # type: ignore[no-untyped-def]
+    (folder / "taken").write_text("mine")
+    code, _, err = typed("diagnose", "damped.csv", "--system", "phi4", "--html", "taken/page.html")
+    assert code == 2
+    assert "cannot be written" in err
+    assert (folder / "taken").read_text() == "mine"
+
+
+def test_a_file_name_of_any_kind_does_no_harm(typed, folder: Path) -> None:  # type: ignore[no-untyped-def]
+    name = "<img src=x onerror=alert(1)>[bold]$&.csv"
+    write(read(folder / "damped.csv"), folder / name)
+    code, _, err = typed("diagnose", name, "--system", "phi4", "--html", "named.html")
+    assert (code, err) == (0, "")
+    page = (folder / "named.html").read_text()
+    assert "<img" not in page
+    assert "&lt;img src=x onerror=alert(1)&gt;[bold]$&amp;.csv" in page
+
+
+def test_help_loads_nothing_heavy() -> None:
+    program = (
+        "import sys; sys.argv = ['latticebench', *{command!r}]\n"
+        "from bench.cli import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
+        "heavy = {{'torch', 'pysindy', 'sympy', 'pandas', 'scipy', 'matplotlib', 'sklearn'}} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    for command in (["diagnose", "--help"], ["data"], ["data", "--json"], ["data", "take", "--help"]):
+        subprocess.run([sys.executable, "-c", program.format(command=command)], check=True, capture_output=True)
