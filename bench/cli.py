@@ -107,7 +107,8 @@ def _recordings(incomplete: str) -> list[str]:
 
 
 def _suite_files() -> list[Path]:
-    return sorted((Path(__file__).parent / "suites").glob("*.toml"))
+    here = Path(__file__).parent
+    return sorted((*here.glob("suites/*.toml"), *here.glob("loop/suites/*.toml")), key=lambda path: path.stem)
 
 
 SystemName = Annotated[
@@ -478,9 +479,15 @@ def run(
     jobs: Annotated[int | None, typer.Option(min=1, help="Worker processes; one a core if not given.")] = None,
     results: Annotated[Path | None, typer.Option(help="Where results are kept; runs/SUITE if not given.")] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Run cases that failed again.")] = False,
+    data: Annotated[Path, typer.Option(help="The folder of measured recordings, for a suite of them.")] = Path("data"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
 ) -> None:
     """Run a suite, continuing where it was stopped, and show its table of errors."""
+    from bench.loop.trial import is_suite
+
+    if is_suite(suite):
+        _run_trials(suite, jobs or os.cpu_count() or 1, results, data, as_json)
+        return
     from bench.provenance import command_line, describe
     from bench.run import run as run_suite
     from bench.screen import progress_bar, show_results
@@ -514,6 +521,45 @@ def run(
     print(f"{len(found)} cases ({statuses}); {tally.ran} run now, {tally.reused} were there; kept in {folder}")
 
 
+def _run_trials(suite: str, jobs: int, results: Path | None, data: Path, as_json: bool) -> None:
+    """Run a suite of diagnoses, and show how often they were right."""
+    from bench.loop.trial import load, run
+    from bench.provenance import command_line
+    from bench.screen import progress
+    from systems.files import write_text
+
+    _, trials = load(suite)
+    folder = results if results is not None else Path("runs") / Path(suite).stem
+    with progress(len(trials)) as step:
+        rows = run(trials, folder, jobs=jobs, data=data, watcher=step)
+    about = {"command": " ".join(["latticebench", *command_line()]), "suite": Path(suite).stem, "jobs": jobs}
+    write_text(folder / "about.txt", json.dumps(about) + "\n")
+    _show_trials(folder, None, as_json)
+    print(f"{len(rows)} diagnoses, kept in {folder}", file=sys.stderr)
+
+
+def _show_trials(folder: Path, out: Path | None, as_json: bool) -> None:
+    """Show the results of a suite of diagnoses, and publish them."""
+    from bench.loop import scores
+    from bench.screen import show_rows
+
+    rows = scores.read(folder)
+    if as_json:
+        print(json.dumps(rows, indent=2))
+    for path in scores.publish(rows, scores.about(rows, folder), out) if out is not None else ():
+        print(path, file=sys.stderr if as_json else sys.stdout)
+    if as_json or out is not None:
+        return
+    made = [row for row in rows if "effect" in row]
+    if made:
+        frame = scores.summary(scores.table(made))
+        show_rows(list(frame.columns), frame.to_numpy().tolist())
+    for row in rows:
+        if "terms" in row:
+            found = row["report"]["verdict"] if row["status"] == "ok" else row["message"]
+            print(f"{row['name']}: {found}")
+
+
 @app.command(epilog="Example:  latticebench table runs/default --out results/default")
 def table(
     folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
@@ -525,6 +571,7 @@ def table(
     as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
 ) -> None:
     """Show the results of a run as a table, and publish them."""
+    from bench.loop import scores
     from bench.provenance import describe
     from bench.screen import show_results
     from bench.store import open_store
@@ -533,6 +580,9 @@ def table(
     if value not in SCORES:
         raise unknown("score", value, SCORES, "--value")
     chosen = _some(only, TABLES, "table")
+    if scores.is_run(folder):
+        _show_trials(folder, out, as_json)
+        return
     store = open_store(folder)
     found = store.all()
     if not found:

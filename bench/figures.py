@@ -247,6 +247,7 @@ def error_against_noise(table: pd.DataFrame) -> Figure:
     )  # fmt: skip
     methods = list(dict.fromkeys(known["method"]))
     lines: dict[str, Any] = {}
+    bound: list[Any] = []
     for axes, (system, library) in zip(grid.flat, panels, strict=False):
         here = known[(known["system"] == system) & (known["library"] == library)]
         for k, method in enumerate(methods):
@@ -263,8 +264,10 @@ def error_against_noise(table: pd.DataFrame) -> Figure:
             lines.setdefault(method, line)
         floor = here.groupby("noise")["bound"].max().dropna()
         if len(floor) > 1:
-            (line,) = axes.plot(floor.index, floor, "--", color="black", lw=1.5, zorder=5, label="Cramer-Rao bound")
-            lines.setdefault("bound", line)
+            (line,) = axes.plot(
+                floor.index, floor, "--", color="black", lw=1.5, zorder=5, label="Cramer-Rao bound, all terms kept"
+            )
+            bound = [line]
         if alone:
             axes.set_xscale("symlog", linthresh=noisy["noise"].min())
         else:
@@ -284,7 +287,7 @@ def error_against_noise(table: pd.DataFrame) -> Figure:
         axes.set_visible(False)
     figure.supxlabel("noise level: sigma over the RMS of the field", fontsize=9)
     figure.supylabel("E2 (median over seeds, with the middle 80 %)", fontsize=9)
-    figure.legend(handles=list(lines.values()), fontsize=8, loc="outside right center", frameon=False)
+    figure.legend(handles=[*lines.values(), *bound], fontsize=8, loc="outside right center", frameon=False)
     return figure
 
 

@@ -29,6 +29,8 @@ FALSE_ALARM = 0.004
 EQUAL = 3.0
 # So much better must a term without a name be before no name is given.
 BETTER = 5.0
+# How far behind the best an effect may be in the screen and still be fitted, where the readings are lost and the screen is rough.
+FAR = 20.0
 # Effects refitted in a round, at most.
 FULL_FITS = 8
 MOST_EFFECTS = 4
@@ -237,7 +239,7 @@ def close(
         if not left or len(fitted.model.changes) >= most:
             rounds.append(Round(tuple(_unfitted(findings))))
             break
-        ranking = _contest(fitted, findings, watcher)
+        ranking = _contest(fitted, findings, watcher, 2 * EQUAL if horizon.follows(fitted) else FAR)
         best = next((one for one in ranking if one.fitted is not None), None)
         count = len(named)
         if best is None or best.fitted is None or best.p * count > FALSE_ALARM:
@@ -269,7 +271,7 @@ def close(
         left = significant([one.finding for one in rounds[-1].ranking])
     fitted, equal = _prune(fitted, equal, all_of_them=True)
     if len(fitted.model.changes) > 1:
-        fitted, equal, left = _reconsider(fitted, equal, left, catalogue, draw, surrogates, watcher)
+        fitted, equal, left = _reconsider(fitted, equal, left, horizon, catalogue, draw, surrogates, watcher)
     verdict = (
         ("partly explained" if left else "explained")
         if fitted.model.changes
@@ -394,13 +396,15 @@ def _unfitted(findings: Sequence[Finding]) -> list[Candidate]:
     return [Candidate(one, one.gain, one.evidence, one.p) for one in findings]
 
 
-def _contest(fitted: Fitted, findings: Sequence[Finding], watcher: Watcher) -> list[Candidate]:
+def _contest(
+    fitted: Fitted, findings: Sequence[Finding], watcher: Watcher, window: float = 2 * EQUAL
+) -> list[Candidate]:
     """Fit the best few effects in full and rank all."""
     ranking: list[Candidate] = []
     best, fits = 0.0, 0
     for one in findings:
         # Other ends change the motion by more than to first order.
-        near = one.evidence > best - 2 * EQUAL or (one.change.ends is not None and one.evidence > EQUAL)
+        near = one.evidence > best - window or (one.change.ends is not None and one.evidence > EQUAL)
         if not one.named or not near or fits >= FULL_FITS:
             ranking.append(Candidate(one, one.gain, one.evidence, one.p))
             continue
@@ -549,6 +553,7 @@ def _reconsider(
     fitted: Fitted,
     equal: list[tuple[str, ...]],
     left: tuple[Finding, ...],
+    horizon: Horizon,
     catalogue: Sequence[Effect],
     draw: np.random.Generator,
     surrogates: int,
@@ -563,22 +568,19 @@ def _reconsider(
         own = fitted.model.changes[number]
         watcher(f"reconsidering {own.effect.name}")
         smaller = polish(fitted.model.without(number), _without_coefficients(fitted, number))
-        if smaller is None:
+        if smaller is None or not horizon.follows(smaller):
+            # Without it the readings are lost: its place is not in doubt.
             continue
-        ranking = _contest(smaller, screen(linearise(smaller), catalogue, draw, surrogates), watcher)
+        ranking = _contest(
+            smaller, screen(linearise(smaller), catalogue, draw, surrogates), watcher, max(2 * EQUAL, margin)
+        )
         tried = [one for one in ranking if one.fitted is not None]
         if not tried:
             continue
         best = tried[0]
-        present = next((one for one in tried if one.name == own.effect.name), None)
-        gain = fitted.gain(smaller)
-        mine = present.evidence if present is not None else replace(best.finding, gain=gain).evidence
-        if (
-            best.name != own.effect.name
-            and best.evidence > mine + margin
-            and best.fitted is not None
-            and best.gain > gain
-        ):
+        present = next((one for one in ranking if one.name == own.effect.name), best).finding
+        mine = present.evidence if own.spread is not None else replace(present, gain=fitted.gain(smaller)).evidence
+        if best.name != own.effect.name and best.evidence > mine + margin and best.fitted is not None:
             # The better one goes to the end, where polish put it.
             fitted = best.fitted
             equal = [*equal[:number], *equal[number + 1 :], ()]

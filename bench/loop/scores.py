@@ -52,6 +52,17 @@ def _rows(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def about(rows: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, Any]:
+    """Describe where results come from: command, commit, machine, versions and seeds."""
+    path = folder / "about.txt"
+    described: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    for name in ("commit", "date", "machine"):
+        described[name] = sorted({str(row["made"][name]) for row in rows})
+    described["versions"] = rows[0]["made"]["versions"]
+    seeds = sorted({int(row["seed"]) for row in rows if "seed" in row})
+    return {**described, "seeds": seeds or [1]}
+
+
 def kind(effect: str) -> str:
     """Sort trials into four kinds."""
     if effect == NONE:

@@ -282,12 +282,14 @@ def _sized(
         InputError: no amount is visible.
     """
     trial = 1e-6 * scale
-    for _ in range(6):
+    for count in range(20):
         size = visible(clean(trial * direction))
         if not size > 0:
             raise InputError("an effect of no size is visible here")
-        # Large sizes may be far from linear.
-        trial *= float(np.clip(z / size, 0.2, 1e5))
+        if abs(size / z - 1) < (1e-6 if count < 6 else 0.02):
+            break
+        # Large sizes may be far from linear; what does not settle is approached by smaller steps.
+        trial *= float(np.clip((z / size) ** (1.0 if count < 6 else 0.5), 0.2, 1e5))
     return trial * direction
 
 
@@ -311,7 +313,11 @@ def _rounded(field: ndarray, step: float) -> ndarray:
 
 
 def _step(u: ndarray, sigma: float, z: float) -> float:
-    """Give the step whose mean rounding error has the size z beside noise and rounding together."""
+    """Give the step whose mean rounding error has the size z beside noise and rounding together.
+
+    Raises:
+        InputError: there is none; n readings tell less than the root of n.
+    """
     parts = np.stack([u.real, u.imag]) if np.iscomplexobj(u) else u[None]
 
     def size(step: float) -> float:
@@ -319,7 +325,10 @@ def _step(u: ndarray, sigma: float, z: float) -> float:
         return float(np.sqrt(np.sum(wrong**2) / (sigma**2 + step**2 / 12)))
 
     steps = sigma * np.geomspace(1, 300, 200)
-    return float(next((step for step in steps if size(step) >= z), steps[-1]))
+    for step in steps:
+        if size(float(step)) >= z:
+            return float(step)
+    raise InputError(f"no rounding of so few readings has the size {z:g}")
 
 
 def _noise(field: ndarray, sigma: float, draw: np.random.Generator) -> ndarray:

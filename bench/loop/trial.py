@@ -109,6 +109,13 @@ def names() -> list[str]:
     return sorted(path.stem for path in HERE.glob("*.toml"))
 
 
+def is_suite(name: str) -> bool:
+    """Say whether a name or a TOML file is a suite of diagnoses."""
+    if not name.endswith(".toml"):
+        return name in names()
+    return bool({"made", "measured"} & set(read_toml(Path(name)))) if Path(name).is_file() else False
+
+
 def load(name: str) -> tuple[str, list[Trial]]:
     """Load a suite by its name, or from a TOML file: its title and trials.
 

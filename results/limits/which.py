@@ -105,10 +105,9 @@ def arranged(table: pd.DataFrame, rows: Sequence[str], value: str, *, bound: boo
     return wide
 
 
-def span(values: pd.Series, digits: int = 2) -> str:
-    """Write the smallest and the largest of some numbers."""
-    known = values.dropna()
-    low, high = f"{known.min():.{digits}g}", f"{known.max():.{digits}g}"
+def span(values: pd.Series) -> str:
+    """Write the smallest and the largest of some numbers, each with two digits."""
+    low, high = (f"{float(f'{value:.2g}'):g}" for value in (values.min(), values.max()))
     return low if low == high else f"{low} to {high}"
 
 

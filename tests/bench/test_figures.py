@@ -73,7 +73,7 @@ def test_error_against_noise_has_a_line_a_method_and_the_bound_as_its_dashed_flo
     lines = {str(line.get_label()): line for line in axes.lines}
     np.testing.assert_allclose(lines["good"].get_ydata(), [0.002, 0.02])
     np.testing.assert_allclose(lines["poor"].get_ydata(), [0.06, 0.6])
-    floor = lines["Cramer-Rao bound"]
+    floor = lines["Cramer-Rao bound, all terms kept"]
     assert floor.get_linestyle() == "--"
     np.testing.assert_allclose(floor.get_xdata(), [0.01, 0.1])
     np.testing.assert_allclose(floor.get_ydata(), [0.001, 0.01])

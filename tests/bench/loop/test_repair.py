@@ -1,0 +1,209 @@
+"""The loop: it names what is missing, adds it and nothing else, and says so when it does not know."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import systems
+from bench.loop.model import Model
+from bench.loop.repair import close, diagnose
+from bench.loop.residual import over_noise
+from bench.loop.specimen import make
+from systems.effects import CATALOGUE
+from systems.lattice import library
+from systems.samples import Samples, read_all
+
+GLIDERS = Path(__file__).parents[4] / "shared" / "data" / "measured" / "gliders.csv"
+
+
+@functools.cache
+def looped(name, effect, z=30, seed=1, sites=9):
+    """A specimen, the loop's course on it, and the true noise on u and v, each real part."""
+    system = systems.find(name)
+    draw = np.random.default_rng(seed)
+    specimen = make(system, effect, z, draw, sites=sites, samples=40, span=8.0, variation=True)
+    data = [replace(specimen.samples.observed(), ends=system.ends)]
+    declared = system.library("equation")
+    course = close(Model(declared, system.order), data, CATALOGUE, np.random.default_rng(0), surrogates=100)
+    sigma = [np.std(specimen.samples.u - specimen.clean.u) / np.sqrt(1 + system.is_complex)]
+    if system.order == 2:
+        sigma.append(np.std(specimen.samples.v - specimen.clean.v))
+    return specimen, course, np.array(sigma)
+
+
+def names(course):
+    return [change.effect.name for change in course.after.model.changes]
+
+
+def errors(name, course):
+    """Relative error of the declared coefficients, before and after."""
+    system = systems.find(name)
+    truth = system.truth(system.library("equation"), {})
+    return [
+        np.linalg.norm(one.solution.state.coefficients[: len(truth)] - truth) / np.linalg.norm(truth)
+        for one in (course.before, course.after)
+    ]
+
+
+# Effects whose lack shifts the declared coefficients, on lattices of both orders.
+PAIRS = [
+    ("phi4", "damping"), ("phi4", "drive"), ("phi4", "defect"), ("phi4", "trap"), ("sine-gordon", "sensor-offset"),
+    ("sine-gordon", "unequal-masses"), ("phi4", "next-neighbour"), ("dnls", "trap"), ("dnls", "sensor-gain"),
+    ("ginzburg-landau", "intersite-nonlinearity"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "effect"), PAIRS)
+def test_the_effect_that_is_missing_is_the_one_that_is_added(name, effect):
+    specimen, course, _ = looped(name, effect)
+    assert names(course) == [effect]
+    assert course.verdict == "explained"
+    assert course.rounds[0].added == effect
+    assert next(one.name for one in course.rounds[0].ranking if one.finding.named) == effect
+    assert len(course.equal) == 1
+    assert len(course.equal[0]) <= 1
+    if effect in ("defect", "sensor-offset", "unequal-masses", "sensor-gain"):
+        assert course.after.model.changes[0].site == specimen.about["site"]
+
+
+@pytest.mark.parametrize(("name", "effect"), PAIRS)
+def test_after_the_cure_only_noise_is_left(name, effect):
+    _, course, sigma = looped(name, effect)
+    assert over_noise(course.before, sigma) > 1.1
+    assert over_noise(course.after, sigma) == pytest.approx(1, abs=0.1)
+    assert course.left == ()
+
+
+@pytest.mark.parametrize(("name", "effect"), PAIRS)
+def test_after_the_cure_the_declared_coefficients_are_nearer_to_the_truth(name, effect):
+    _, course, _ = looped(name, effect)
+    before, after = errors(name, course)
+    assert after < 0.8 * before
+
+
+@pytest.mark.parametrize(
+    ("name", "effect", "sign"), [("phi4", "damping", -1), ("phi4", "trap", 1), ("phi4", "next-neighbour", 1), ("phi4", "defect", 1)]
+)  # fmt: skip
+def test_its_coefficient_is_the_one_that_is_in_the_data(name, effect, sign):
+    specimen, course, _ = looped(name, effect)
+    count = len(course.before.model.declared.terms)
+    found = course.after.solution.state.coefficients[count]
+    error = np.sqrt(np.diag(course.after.solution.covariance))[count]
+    assert found == pytest.approx(sign * np.real(specimen.amount), abs=4 * error)
+    assert error < abs(found) / 10
+
+
+def test_the_parameter_that_was_searched_is_within_its_error():
+    specimen, course, _ = looped("phi4", "drive")
+    change = course.after.model.changes[0]
+    assert abs(change.psi["omega"] - specimen.about["omega"]) < 4 * course.after.psi_errors[0]["omega"]
+    specimen, course, _ = looped("sine-gordon", "unequal-masses")
+    change = course.after.model.changes[0]
+    assert abs(change.psi["scale"] - np.real(specimen.amount)) < 4 * course.after.psi_errors[0]["scale"]
+    assert course.after.psi_errors[0]["scale"] < abs(change.psi["scale"]) / 10
+
+
+@pytest.mark.parametrize("name", ["phi4", "sine-gordon", "dnls", "ginzburg-landau"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_where_nothing_is_missing_nothing_is_added(name, seed):
+    _, course, sigma = looped(name, "none", 0, seed)
+    assert course.verdict == "nothing missing"
+    assert names(course) == []
+    assert course.after is course.before
+    assert course.equal == ()
+    assert over_noise(course.after, sigma) == pytest.approx(1, abs=0.1)
+
+
+OUTSIDE = [
+    ("phi4", "other: weak-bond"), ("phi4", "other: friction-between"), ("sine-gordon", "other: friction-between"),
+    ("dnls", "other: weak-bond"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "effect"), OUTSIDE)
+def test_what_is_outside_the_catalogue_gets_no_wrong_name(name, effect):
+    _, course, sigma = looped(name, effect)
+    assert course.verdict in ("unexplained", "partly explained")
+    assert course.left
+    assert over_noise(course.after, sigma) > 1.1
+
+
+# Two at once ------------------------------------------------------------------------------------------------------------------
+
+
+def two_at_once():
+    """A damped and driven chain whose third sensor has an offset, written out and integrated by SciPy."""
+    t = np.linspace(0, 12, 80)
+
+    def rate(t, y):
+        u, v = np.split(y, 2)
+        beside = np.concatenate([u[1:], u[-1:]]) + np.concatenate([u[:1], u[:-1]])
+        return np.concatenate([v, 0.9 * (beside - 2 * u) - u - 0.4 * u**3 - 0.03 * v])
+
+    n = np.arange(9)
+    start = np.concatenate([np.sin(1 + 0.7 * n), 0.5 * np.cos(n)])
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    draw = np.random.default_rng(3)
+    u, v = (part + 0.005 * draw.normal(size=part.shape) for part in (y[:, :9], y[:, 9:]))
+    u[:, 2] += 0.03
+    return Samples(t, u, v, ends="free")
+
+
+def test_of_two_effects_at_once_both_are_found_with_their_sizes():
+    declared = library("duffing", ["u[n+1]+u[n-1]-2*u[n]", "u[n]", "u[n]**3"])
+    truth = np.array([0.9, -1.0, -0.4])
+    watched = []
+    found = diagnose(declared, 2, [two_at_once()], CATALOGUE, truth=truth, watcher=watched.append)
+    course = found.course
+    assert sorted(names(course)) == ["damping", "sensor-offset"]
+    assert course.verdict == "explained"
+    assert [one.added for one in course.rounds] == [*names(course), None]
+    assert course.after.solution.state.coefficients[3] == pytest.approx(-0.03, abs=0.003)
+    offset = next(one for one in course.after.model.changes if one.effect.name == "sensor-offset")
+    assert offset.psi["real_3"] == pytest.approx(0.03, abs=0.003)
+    assert found.noise == pytest.approx(0.005, rel=0.1)
+    assert found.residual[0] > 1.5
+    assert found.residual[1] == pytest.approx(1, abs=0.1)
+    assert found.coefficients[1] < found.coefficients[0] < 0.2
+    assert found.forecast[1] < found.forecast[0]
+    assert found.criterion[1] < found.criterion[0] - 100
+    assert len(watched) > 4
+
+
+def test_the_truth_of_simulated_samples_is_not_looked_at_and_the_same_seed_gives_the_same_course():
+    specimen, _, _ = looped("phi4", "damping")
+    system = systems.find("phi4")
+    lie = replace(
+        specimen.samples, exact=replace(specimen.clean, u=1e3 * specimen.clean.u), sigma=99.0, ends=system.ends
+    )
+    plain = replace(specimen.samples, ends=system.ends)
+    one, other = (diagnose(system.library("equation"), 2, [data], CATALOGUE) for data in (lie, plain))
+    assert one.residual == other.residual
+    assert names(one.course) == names(other.course) == ["damping"]
+    assert one.coefficients is None
+
+
+# Measured data ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not GLIDERS.exists(), reason=f"{GLIDERS} is not there: `latticebench data` says where to get it")
+def test_of_the_measured_gliders_the_offsets_and_the_unequal_masses_are_named():
+    declared = library("uniform", ["u[n+1]+u[n-1]-2*u[n]", "u[n]"])
+    found = diagnose(declared, 2, read_all([GLIDERS], "fixed"), CATALOGUE)
+    present = names(found.course)
+    equal = {name for group in found.course.equal for name in group}
+    assert "unequal-masses" in present
+    assert "sensor-offset" in {*present, *equal}
+    change = next(one for one in found.course.after.model.changes if one.effect.name == "unequal-masses")
+    scale = 1 + change.psi["scale"]
+    assert max(scale, 1 / scale) == pytest.approx(2.48, rel=0.03)
+    assert found.residual[0] > 5
+    assert found.residual[1] < 2
+    assert found.forecast[1] < 0.2 * found.forecast[0]
