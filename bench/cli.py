@@ -230,7 +230,7 @@ def simulate(
 
 @app.command(
     epilog='Examples:  latticebench fit phi4.csv --system phi4 --library lib2 --method stlsq --set threshold=0.1\n\n'
-    '           latticebench fit my.csv --terms "u[n+1]; u[n-1]; u[n]; u[n]**3" --order 2 --method least-squares'
+    '           latticebench fit my.csv --terms "u\\[n+1]; u\\[n-1]; u\\[n]; u\\[n]**3" --order 2 --method least-squares'
 )  # fmt: skip
 def fit(
     files: Annotated[list[Path], typer.Argument(help="One or more .csv, .npz or .parquet files.")],
@@ -318,11 +318,20 @@ def diagnose(
     html_out: Annotated[
         Path | None, typer.Option("--html", metavar="OUT", help="Write one HTML file with pictures.")
     ] = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help="Take the declared equation's first coefficients from this method's fit (of `list methods`); whole trajectories otherwise.",
+            autocompletion=_methods,
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated noise that evidence is judged by.")] = 1,
 ) -> None:
     """Say what a declared equation lacks: find the residual, trace it to an effect, add that, and show the error before and after."""
+    import methods
     from bench.loop.repair import diagnose as close_the_loop
     from bench.loop.report import content, show, watching
+    from methods.method import Skipped, make, solve
     from systems.effects import CATALOGUE, load
     from systems.files import write_text
     from systems.samples import read_all
@@ -335,11 +344,26 @@ def diagnose(
     catalogue = (*CATALOGUE, *(load(effects) if effects is not None else ()))
     ends = ends or ("unknown" if known is None else known.ends)
     data = read_all(files, ends)
+    if known is not None and known.is_complex != data[0].is_complex:
+        kinds = ("real", "complex")
+        raise InputError(
+            f"{data[0].source}: the field is {kinds[data[0].is_complex]}, that of {known.name} is {kinds[known.is_complex]}; "
+            "choose another --system, or give --terms"
+        )
     # Read together, since the two must be of the same chain.
     later = read_all([*files, *holdout], ends)[len(data) :] if holdout else []
     try:
         with watching() as watcher, redirect_stdout(sys.stderr):
-            found = close_the_loop(declared, order, data, catalogue, seed, held_out=later, watcher=watcher)
+            start = (
+                None
+                if method is None
+                else solve(make(methods.find(method), {}), data, declared, order, seed).coefficients
+            )
+            found = close_the_loop(declared, order, data, catalogue, seed, held_out=later, watcher=watcher, start=start)
+    except Skipped as reason:
+        raise InputError(
+            f"method {method!r} cannot fit {data[0].source}: {reason}; choose another with --method"
+        ) from None
     except InputError:
         raise
     except Exception as error:

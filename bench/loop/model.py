@@ -357,15 +357,22 @@ def rates(record: Record, state: State, number: int) -> Float[ndarray, "time ord
     return dynamics.whole(rate, None)
 
 
-def first_fit(model: Model, data: Sequence[Samples], steps: int = 40) -> Fitted:
-    """Fit a model from a blind start.
+def first_fit(
+    model: Model, data: Sequence[Samples], steps: int = 40, coefficients: Float[ndarray, " terms"] | None = None
+) -> Fitted:
+    """Fit a model from a blind start, or from coefficients that another method found.
 
     Raises:
         InputError: the samples do not even give a start.
     """
     data = tuple(without_halves(samples) for samples in data)
     records = model.records(data)
-    solution = maximise(records, approach(data, records, steps), steps=steps, tolerance=0.01)
+    begin = (
+        approach(data, records, steps)
+        if coefficients is None
+        else replace(guess(data, records), coefficients=coefficients)
+    )
+    solution = maximise(records, begin, steps=steps, tolerance=0.01)
     if not solution.converged:
         other = maximise(records, guess(data, records), steps=steps, tolerance=0.01)
         if other.converged or other.criterion < solution.criterion:
@@ -412,7 +419,6 @@ def carried(fitted: Fitted, data: Sequence[Samples]) -> State:
 
 def corrected(
     model: Model,
-    data: Sequence[Samples],  # noqa: ARG001
     state: State,
     plain: Sequence[Record],
 ) -> list[Record]:
@@ -449,6 +455,6 @@ def refit(model: Model, data: Sequence[Samples], start: State, *, steps: int = 2
             fresh = guess([data[number]], [record])
             nodes[number], splines[number] = fresh.nodes[0], fresh.splines[0]
     state = State(coefficients, tuple(nodes), tuple(splines))
-    seen = corrected(model, data, state, records)
+    seen = corrected(model, state, records)
     solution = maximise(seen, state, steps=steps, tolerance=tolerance, accuracy=ACCURACY)
     return Fitted(model, tuple(data), tuple(seen), solution)

@@ -15,6 +15,7 @@ from bench.loop.tangent import Tangent, linearise
 from bench.loop.trace import Finding, screen
 from methods.method import check_fit
 from systems.effects import Effect
+from systems.errors import InputError
 from systems.lattice import Library
 from systems.samples import Samples, SimulatedSamples
 from systems.sensitivity import split_parts
@@ -38,6 +39,9 @@ POLISH = 8
 # A residual of more than so many times the noise is gross: the model is then followed over shorter pieces.
 GROSS = 3.0
 MOST_PIECES = 64
+# Readings beyond twice the number of unknowns that a test of what is left needs.
+SPARE = 10
+ARITHMETIC = 1e-6
 LONGEST = 4000
 # Thinning leaves at least so many samples.
 ENOUGH = 500
@@ -146,6 +150,7 @@ def diagnose(
     held_out: Sequence[Samples] = (),
     truth: Float[ndarray, " terms"] | None = None,
     watcher: Watcher = lambda _: None,
+    start: Float[ndarray, " terms"] | None = None,
 ) -> Diagnosis:
     """Run the loop on recordings.
 
@@ -158,15 +163,21 @@ def diagnose(
         held_out: recordings to judge forecasts on; the last 30 % of each of `data` when there are none.
         truth: the declared coefficients' true values, only to report their error.
         watcher: is told what is being done.
+        start: coefficients of another method's fit, to begin the declared equation's with.
 
     Raises:
         InputError: the equation cannot be set up on the data.
     """
     shown = [one.observed() if isinstance(one, SimulatedSamples) else one for one in data]
     check_fit(shown, declared, order)
+    for one in shown:
+        if not np.nanmax(np.abs(one.u - np.nanmean(one.u))) > 0:
+            raise InputError(f"{one.source}: nothing moves; a diagnosis needs a motion")
     # More threads than this are slower on matrices of these sizes.
     with threadpool_limits(1):
-        course = close(Model(declared, order), shown, catalogue, np.random.default_rng(seed), watcher=watcher)
+        course = close(
+            Model(declared, order), shown, catalogue, np.random.default_rng(seed), watcher=watcher, start=start
+        )
         return _judge(course, declared, held_out, truth, watcher)
 
 
@@ -209,6 +220,7 @@ def close(
     watcher: Watcher = lambda _: None,
     most: int = MOST_EFFECTS,
     surrogates: int = 200,
+    start: Float[ndarray, " terms"] | None = None,
 ) -> Course:
     """Go round the loop.
 
@@ -222,10 +234,16 @@ def close(
         watcher: is told what is being done.
         most: effects that are added at most.
         surrogates: simulated recordings that the null distribution comes from.
+        start: the declared coefficients to begin with, where another method has fitted them.
     """
     watcher("fitting the declared equation")
     horizon = Horizon.of([thinned(samples, model.order) for samples in data], model)
-    before = horizon.first(model)
+    before = horizon.first(model, start)
+    if before.count < 2 * before.parameters + SPARE:
+        raise InputError(
+            f"{data[0].source}: {before.count:.0f} readings are too few for {before.parameters:.0f} unknowns (the coefficients and each "
+            "trajectory's start); give longer or more records"
+        )
     fitted = before
     rounds: list[Round] = []
     equal: list[tuple[str, ...]] = []
@@ -234,7 +252,7 @@ def close(
     while True:
         watcher(f"tracing what is left, round {len(rounds) + 1}")
         findings = screen(linearise(fitted), catalogue, draw, surrogates)
-        left = significant(findings)
+        left = () if _exact(fitted) else significant(findings)
         named = [one for one in findings if one.named]
         if not left or len(fitted.model.changes) >= most:
             rounds.append(Round(tuple(_unfitted(findings))))
@@ -328,11 +346,11 @@ class Horizon:
         """Say whether a model follows the readings from end to end, so that small differences between terms mean something."""
         return self.follows(fitted) and max(len(samples.t) for samples in fitted.data) >= self.lengths[0]
 
-    def first(self, model: Model) -> Fitted:
+    def first(self, model: Model, start: Float[ndarray, " terms"] | None = None) -> Fitted:
         """Fit a model as far as it can follow; the shortest pieces where it never does."""
         for length in self.lengths:
             last = length == self.lengths[-1]
-            fitted = first_fit(model, cut(self.data, length), steps=40 if last else 15)
+            fitted = first_fit(model, cut(self.data, length), steps=40 if last else 15, coefficients=start)
             if self.follows(fitted):
                 break
         return fitted
@@ -381,6 +399,12 @@ def _told(samples: Samples, step: int) -> float:
             return float("inf")
         left.append(value - CubicSpline(t[::step], value[::step])(t))
     return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
+
+
+def _exact(fitted: Fitted) -> bool:
+    """Say whether a model leaves less than any instrument could show; what is left is arithmetic."""
+    values = [record.value[record.seen] for record in fitted.records]
+    return float(np.max(fitted.sigma)) < ARITHMETIC * float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
 
 
 def significant(findings: Sequence[Finding]) -> tuple[Finding, ...]:

@@ -36,6 +36,7 @@ HELD_OUT = 0.3
 GLANCE = 1000
 # Of a record in many pieces, so many are forecast.
 MOST_FORECASTS = 8
+FEWEST_ROWS = 4
 
 
 def noise(fitted: Fitted) -> Float[ndarray, " levels"]:
@@ -160,8 +161,11 @@ def forecast(fitted: Fitted, held_out: Sequence[Samples] = ()) -> list[Forecast]
     """
     if held_out:
         # How a chain ends is known as well as for the recordings that were fitted.
-        return [_predict(fitted, samples, HELD_OUT, None) for samples in held_out]
-    chosen = np.unique(np.linspace(0, len(fitted.data) - 1, MOST_FORECASTS).astype(int))
+        return [_predict(fitted, samples, HELD_OUT, None) for samples in held_out if len(samples.t) >= FEWEST_ROWS]
+    enough = [number for number, samples in enumerate(fitted.data) if len(samples.t) >= FEWEST_ROWS]
+    chosen = (
+        [enough[k] for k in np.unique(np.linspace(0, len(enough) - 1, MOST_FORECASTS).astype(int))] if enough else []
+    )
     data = [fitted.data[k] for k in chosen]
     cuts = [max(2, round(len(samples.t) * (1 - HELD_OUT))) for samples in fitted.data]
     early = [rows_of(samples, 0, cut) for samples, cut in zip(fitted.data, cuts, strict=True)]
@@ -169,7 +173,7 @@ def forecast(fitted: Fitted, held_out: Sequence[Samples] = ()) -> list[Forecast]
     start = replace(state, nodes=tuple(nodes[:cut] for nodes, cut in zip(state.nodes, cuts, strict=True)))
     again = refit(fitted.model, early, start)
     return [
-        _predict(again, samples, cuts[number] / len(samples.t), int(number))
+        _predict(again, samples, cuts[number] / len(samples.t), number)
         for number, samples in zip(chosen, data, strict=True)
     ]
 
@@ -201,7 +205,7 @@ def _predict(fitted: Fitted, samples: Samples, known: float, number: int | None)
         early = [rows_of(samples, 0, cut)]
         records = model.records(early)
         start = replace(guess(early, records), coefficients=coefficients)
-        records = corrected(model, early, start, records)
+        records = corrected(model, start, records)
         state = maximise(records, start, steps=20, tolerance=0.02, noise=sigma, held=True).state
         nodes = state.nodes[0]
     else:

@@ -129,7 +129,7 @@ def rarity(largest: float, tries: float) -> float:
     """-ln of the chance that the largest of so many independent tries is larger."""
     if largest > np.log(tries) + 30:
         return float(largest - np.log(tries))
-    return float(-np.log(max(-np.expm1(-tries * np.exp(-largest)), 1e-300)))
+    return float(-np.log(max(-np.expm1(tries * np.log1p(-min(np.exp(-largest), 1 - 1e-15))), 1e-300)))
 
 
 # The search ---------------------------------------------------------------------------------------------------------------------
@@ -207,6 +207,8 @@ def _scores(
     groups: Sequence[tuple[str, bool, list[Try]]], residual: ndarray, total: Any, spare: float
 ) -> list[tuple[ndarray, ndarray, list[int]]]:
     """For each group: likelihood gains (tries, draws), their tails, and the number of coefficients of each try."""
+    if not groups:
+        return []
     every = np.concatenate([one.basis for _, _, tries in groups for one in tries], axis=1)
     scores = every.T @ residual
     found, begin = [], 0
@@ -259,14 +261,18 @@ def _with_spread(tangent: Tangent, one: Try) -> Change:
 
 
 def _try(tangent: Tangent, change: Change, columns: ndarray, random: bool = False) -> Try | None:
-    """Make a try of columns that may be within what the model can do."""
+    """Make a try of columns that may be within what the model can do; None where they could explain nearly any residual."""
     left = tangent.new(columns)
     if random:
         basis, values, _ = np.linalg.svd(left, full_matrices=False)
         kept = values > 1e-6 * max(values[0], 1e-300) if len(values) else np.zeros(0, dtype=bool)
-        return Try(change, basis[:, kept], values[kept] ** 2) if np.sum(kept) > 1 and values[0] > 0 else None
+        return (
+            Try(change, basis[:, kept], values[kept] ** 2)
+            if 1 < np.sum(kept) <= tangent.spare / 2 and values[0] > 0
+            else None
+        )
     basis = orthonormal(left)
-    return Try(change, basis) if basis.shape[1] else None
+    return Try(change, basis) if 0 < basis.shape[1] <= tangent.spare / 4 else None
 
 
 def _addable(effect: Effect, present: Sequence[Change]) -> bool:
@@ -701,7 +707,7 @@ def _probes(tangent: Tangent) -> list[tuple[str, bool, list[Try]]]:
         rows = len(path.record.times)
         x = (np.arange(rows) + 0.5) / rows
         columns = []
-        for k in range(low, min(high, rows)):
+        for k in range(low, high):
             for mode in modes:
                 for part in range(dynamics.parts):
                     wrong = np.zeros(path.weight.shape)

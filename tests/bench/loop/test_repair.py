@@ -16,6 +16,7 @@ from bench.loop.repair import close, diagnose
 from bench.loop.residual import over_noise
 from bench.loop.specimen import make
 from systems.effects import CATALOGUE
+from systems.errors import InputError
 from systems.lattice import library
 from systems.samples import Samples, read_all
 
@@ -207,3 +208,39 @@ def test_of_the_measured_gliders_the_offsets_and_the_unequal_masses_are_named():
     assert found.residual[0] > 5
     assert found.residual[1] < 2
     assert found.forecast[1] < 0.2 * found.forecast[0]
+
+
+# Small and ragged recordings -------------------------------------------------------------------------------------------------
+
+
+def waves(rows, sites, velocities, seed=0):
+    draw = np.random.default_rng(seed)
+    t = 0.2 * np.arange(rows)
+    phase = t[:, None] + np.arange(sites)
+    noise = 0.01 * draw.normal(size=(2, rows, sites))
+    return Samples(t, np.cos(phase) + noise[0], -np.sin(phase) + noise[1] if velocities else None, ends="free")
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize(("rows", "sites"), [(2, 9), (3, 9), (4, 9), (3, 1), (5, 1), (12, 1), (12, 2)])
+def test_a_recording_of_a_few_rows_or_sites_has_a_verdict_or_a_reason(rows, sites, velocities):
+    declared = library("x", ["u[n]", "u[n]**3"])
+    try:
+        verdict = diagnose(declared, 2, [waves(rows, sites, velocities)], CATALOGUE).course.verdict
+    except InputError as error:
+        verdict = str(error).splitlines()[0]
+    assert verdict
+
+
+@pytest.mark.parametrize(("rows", "sites", "velocities"), [(12, 1, False), (20, 1, True)])
+def test_a_handful_of_readings_is_no_reason_for_a_claim(rows, sites, velocities):
+    declared = library("x", ["u[n]", "u[n]**3"])
+    data = [waves(rows, sites, velocities, seed) for seed in range(8)]
+    verdicts = [diagnose(declared, 2, [one], CATALOGUE).course.verdict for one in data]
+    assert verdicts.count("nothing missing") >= 7
+
+
+def test_trajectories_of_different_lengths_are_looked_at_together():
+    data = [waves(30, 3, True), waves(10, 3, True, 1), waves(11, 3, True, 2)]
+    found = diagnose(library("x", ["u[n]", "u[n]**3"]), 2, data, CATALOGUE)
+    assert found.course.verdict == "nothing missing"

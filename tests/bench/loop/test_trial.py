@@ -1,0 +1,83 @@
+"""Suites of diagnoses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bench.loop import scores
+from bench.loop.trial import Made, Measured, is_suite, load, names, run
+from systems.effects import CATALOGUE
+from systems.errors import InputError
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_suite_of_diagnoses_loads_and_has_a_title(name: str) -> None:
+    title, trials = load(name)
+    assert title
+    assert trials
+
+
+def test_the_suite_loop_has_every_effect_of_the_catalogue() -> None:
+    _, trials = load("loop")
+    there = {trial.effect for trial in trials if isinstance(trial, Made)}
+    missing = {effect.name for effect in CATALOGUE} - there
+    # Other names for a term that the declared equations of the paper's lattices have already.
+    assert missing <= {"nonlinear-loss"}
+    assert {"none", "other: weak-bond", "damping+drive"} <= there
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ('[[made]]\neffects = ["dampign"]\nsystems = ["phi4"]\n', "dampign"),
+        ('[[made]]\neffects = ["damping"]\nsystems = ["phi5"]\n', "phi5"),
+        ('[[made]]\neffects = ["damping"]\nsystems = ["phi4"]\nnoize = [1]\n', "noize"),
+        ('[[measured]]\nname = "x"\nabout = ""\nfile = "x.csv"\nterms = "u[n]"\norder = 3\n', "order"),
+    ],
+)
+def test_an_unsound_suite_is_told_by_its_key(tmp_path: Path, text: str, part: str) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=part):
+        load(str(path))
+
+
+def test_a_suite_of_cases_is_none_of_diagnoses() -> None:
+    assert is_suite("loop")
+    assert not is_suite("tiny")
+
+
+def test_a_run_continues_where_it_was_stopped_and_is_published(tmp_path: Path) -> None:
+    trials = [
+        Made(system="phi4", effect="defect", z=30.0, sites=9, samples=30),
+        Made(system="phi4", effect="none", sites=9, samples=30),
+        Measured(name="gone", about="nothing", file="gone.csv", terms="u[n]", order=2),
+    ]
+    done: list[int] = []
+    rows = run(trials, tmp_path / "runs", watcher=lambda: done.append(1))
+    assert [row["status"] for row in rows] == ["ok", "ok", "skipped"]
+    assert rows[0]["named"] == ["defect"]
+    assert rows[1]["verdict"] == "nothing missing"
+    assert "gone.csv" in rows[2]["message"]
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").iterdir()}
+    assert run(trials, tmp_path / "runs") == rows
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").iterdir()}
+    assert scores.is_run(tmp_path / "runs")
+    written = scores.publish(rows, scores.about(rows, tmp_path / "runs"), tmp_path / "out")
+    assert {path.name for path in written} >= {"trials.csv", "summary.md", "confusion.png", "measured.md"}
+    assert json.loads(json.dumps(rows)) == rows
+
+
+def test_a_name_in_a_group_of_three_is_not_right() -> None:
+    from bench.loop.trial import _right
+
+    assert _right(["damping"], ["damping"], [[]], "explained", "damping")
+    assert _right(["damping"], ["quadratic-drag"], [["damping"]], "explained", "damping")
+    assert not _right(["damping"], ["quadratic-drag"], [["damping", "memory"]], "explained", "damping")
+    assert not _right([], ["damping"], [[]], "explained", "none")
+    assert not _right([], ["damping"], [[]], "explained", "other: weak-bond")
+    assert _right([], ["damping"], [[]], "partly explained", "other: weak-bond")
+    assert _right(["damping", "drive"], ["drive", "damping"], [[], []], "explained", "damping+drive")
