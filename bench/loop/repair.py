@@ -38,13 +38,13 @@ MOST_EFFECTS = 4
 POLISH = 8
 # A residual of more than so many times the noise is gross: the model is then followed over shorter pieces.
 GROSS = 3.0
-MOST_PIECES = 64
+MOST_PIECES = 100
 # Readings beyond twice the number of unknowns that a test of what is left needs.
 SPARE = 10
 ARITHMETIC = 1e-6
 LONGEST = 4000
 # Thinning leaves at least so many samples.
-ENOUGH = 500
+ENOUGH = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,6 +253,8 @@ def close(
         watcher(f"tracing what is left, round {len(rounds) + 1}")
         findings = screen(linearise(fitted), catalogue, draw, surrogates)
         left = () if _exact(fitted) else significant(findings)
+        if not horizon.follows(fitted):
+            findings = _steady(findings)
         named = [one for one in findings if one.named]
         if not left or len(fitted.model.changes) >= most:
             rounds.append(Round(tuple(_unfitted(findings))))
@@ -399,6 +401,15 @@ def _told(samples: Samples, step: int) -> float:
             return float("inf")
         left.append(value - CubicSpline(t[::step], value[::step])(t))
     return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
+
+
+def _steady(findings: list[Finding]) -> list[Finding]:
+    """Leave out what acts at its own frequency or time, if anything else is significant.
+
+    Where the readings are lost, a force in step with the motion can stand for nearly anything.
+    """
+    steady = [one for one in findings if not one.named or one.change.effect.acts not in ("harmonic", "pulse")]
+    return steady if any(one.named for one in significant(steady)) else findings
 
 
 def _exact(fitted: Fitted) -> bool:

@@ -135,13 +135,13 @@ def test_forecasts_are_judged_on_the_file_that_is_held_out(typed) -> None:  # ty
         (["damped.csv", "--terms", "v[n]", "--order", "1"], "order 1 has no velocity"),
         (["damped.csv", "--system", "fi4"], "unknown system 'fi4'"),
         (["damped.csv", "--system", "mine.toml"], "mine.toml: it has no library 'equation'"),
-        (["damped.csv", "--system", "dnls"], "damped.csv: the library uses i, but the field is real"),
+        (["damped.csv", "--system", "dnls"], "damped.csv: the field is real, that of dnls is complex"),
         (["damped.csv", "--system", "phi4", "--ends", "loose"], "--ends"),
         (["damped.csv", "--system", "phi4", "--effects", "none.toml"], "none.toml"),
         (["damped.csv", "--system", "phi4", "--effects", "own-bad.toml"], "own-bad.toml: effect 1: unknown key 'size'"),
         (["damped.csv", "--system", "phi4", "--holdout", "short.csv"], "short.csv: it has 4 sites, damped.csv has 9"),
         (["damped.csv", "--system", "phi4", "--seed", "-1"], "--seed"),
-        (["damped.csv", "--system", "phi4", "--method", "guess"], "--method"),
+        (["damped.csv", "--system", "phi4", "--method", "guess"], "unknown method"),
     ],
 )
 def test_bad_input_is_one_line_that_says_where(typed, arguments: list[str], words: str) -> None:  # type: ignore[no-untyped-def]

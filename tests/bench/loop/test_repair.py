@@ -19,6 +19,7 @@ from systems.effects import CATALOGUE
 from systems.errors import InputError
 from systems.lattice import library
 from systems.samples import Samples, read_all
+from systems.simulate import simulate
 
 GLIDERS = Path(__file__).parents[4] / "shared" / "data" / "measured" / "gliders.csv"
 
@@ -201,7 +202,8 @@ def test_of_the_measured_gliders_the_offsets_and_the_unequal_masses_are_named():
     present = names(found.course)
     equal = {name for group in found.course.equal for name in group}
     assert "unequal-masses" in present
-    assert "sensor-offset" in {*present, *equal}
+    assert present[0] == "sensor-offset"
+    assert {"damping", "quadratic-drag"} & {*present, *equal}
     change = next(one for one in found.course.after.model.changes if one.effect.name == "unequal-masses")
     scale = 1 + change.psi["scale"]
     assert max(scale, 1 / scale) == pytest.approx(2.48, rel=0.03)
@@ -232,12 +234,29 @@ def test_a_recording_of_a_few_rows_or_sites_has_a_verdict_or_a_reason(rows, site
     assert verdict
 
 
-@pytest.mark.parametrize(("rows", "sites", "velocities"), [(12, 1, False), (20, 1, True)])
+@pytest.mark.parametrize(("rows", "sites", "velocities"), [(24, 1, False), (20, 1, True)])
 def test_a_handful_of_readings_is_no_reason_for_a_claim(rows, sites, velocities):
     declared = library("x", ["u[n]", "u[n]**3"])
     data = [waves(rows, sites, velocities, seed) for seed in range(8)]
     verdicts = [diagnose(declared, 2, [one], CATALOGUE).course.verdict for one in data]
     assert verdicts.count("nothing missing") >= 7
+
+
+def test_fewer_readings_than_a_test_needs_are_refused_with_their_number():
+    with pytest.raises(InputError, match="12 readings are too few for 4 unknowns"):
+        diagnose(library("x", ["u[n]", "u[n]**3"]), 2, [waves(12, 1, False)], CATALOGUE)
+
+
+def test_a_motion_without_noise_is_no_reason_for_a_claim():
+    phi4 = systems.find("phi4")
+    found = diagnose(phi4.library("equation"), 2, [replace(simulate(phi4, sites=9), ends="free")], CATALOGUE)
+    assert found.course.verdict == "nothing missing"
+
+
+def test_what_does_not_move_is_refused():
+    still = Samples(np.arange(50.0), np.zeros((50, 3)), ends="free")
+    with pytest.raises(InputError, match="nothing moves"):
+        diagnose(library("x", ["u[n]"]), 2, [still], CATALOGUE)
 
 
 def test_trajectories_of_different_lengths_are_looked_at_together():
