@@ -43,6 +43,7 @@ MOST_PIECES = 100
 SPARE = 10
 ARITHMETIC = 1e-6
 LONGEST = 4000
+MOST_SAMPLES = 40_000
 # Thinning leaves at least so many samples.
 ENOUGH = 2000
 
@@ -120,6 +121,7 @@ class Diagnosis:
         criterion: the Bayesian information criterion, before and after, less a common constant.
         coefficients: relative error of the declared coefficients, |xi - xi*| / |xi*|, before and after, where a truth is known.
         truth: the true declared coefficients, or None.
+        used: how many sample times the loop looked at, and how many there are.
     """
 
     course: Course
@@ -130,6 +132,7 @@ class Diagnosis:
     criterion: tuple[float, float]
     coefficients: tuple[float, float] | None = None
     truth: Float[ndarray, " terms"] | None = None
+    used: tuple[int, int] = (0, 0)
 
     @property
     def forecast(self) -> tuple[float, float]:
@@ -178,7 +181,7 @@ def diagnose(
         course = close(
             Model(declared, order), shown, catalogue, np.random.default_rng(seed), watcher=watcher, start=start
         )
-        return _judge(course, declared, held_out, truth, watcher)
+        return _judge(course, declared, held_out, truth, sum(len(one.t) for one in shown), watcher)
 
 
 def _judge(
@@ -186,13 +189,14 @@ def _judge(
     declared: Library,
     held_out: Sequence[Samples],
     truth: Float[ndarray, " terms"] | None,
+    recorded: int,
     watcher: Watcher,
 ) -> Diagnosis:
     """Measure the errors before and after."""
     watcher("forecasting")
     sides = (course.before, alike(course.after, course.before))
     size = noise(course.after)
-    gain = course.after.gain(course.before)
+    gain = sides[1].gain(sides[0])
     more = course.after.parameters - course.before.parameters
     errors = None
     if truth is not None:
@@ -208,6 +212,7 @@ def _judge(
         (forecast(sides[0], held_out), forecast(sides[1], held_out)),
         (0.0, more * float(np.log(course.after.count)) - gain),
         None if errors is None else (errors[0], errors[1]), truth,
+        (sum(len(one.t) for one in course.after.data), recorded),
     )  # fmt: skip
 
 
@@ -224,7 +229,7 @@ def close(
 ) -> Course:
     """Go round the loop.
 
-    A long record that is sampled far more densely than it moves is thinned first.
+    A long record that is sampled far more densely than it moves is thinned first, and of a very long one parts are looked at.
 
     Args:
         model: the declared equation.
@@ -329,6 +334,11 @@ class Horizon:
     def of(cls, data: Sequence[Samples], model: Model) -> Horizon:
         """Find the lengths that make sense."""
         longest = max(len(samples.t) for samples in data)
+        if sum(len(samples.t) for samples in data) > MOST_SAMPLES:
+            # Of a very long record evenly spaced parts are enough.
+            parts = cut(data, LONGEST)
+            data = [parts[k] for k in np.linspace(0, len(parts) - 1, MOST_SAMPLES // LONGEST).astype(int)]
+            longest = LONGEST
         levels = 1 if model.order == 1 or data[0].v is None else 2
         least = max(4 * model.order // levels + 2, -(-sum(len(samples.t) for samples in data) // MOST_PIECES))
         lengths = [min(longest, LONGEST)]

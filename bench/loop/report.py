@@ -389,6 +389,11 @@ def notes(diagnosis: Diagnosis) -> list[str]:
     if step and share > ROUNDING:
         size = f"{100 * share:.2g} %" if share < 1 else "all"
         found.append(f"The readings are multiples of {step:.4g}: rounding alone makes {size} of the noise's variance.")
+    used, recorded = diagnosis.used
+    if used < recorded:
+        found.append(
+            f"Of {recorded} sample times {used} were looked at: the record is sampled more densely than it moves, or very long."
+        )
     kept = {change.effect.name for change in course.after.model.changes}
     gone = list(dict.fromkeys(one.added for one in course.rounds if one.added and one.added not in kept))
     if gone:
