@@ -209,7 +209,8 @@ def _judge(
         course, size,
         (over_noise(course.before, size), over_noise(course.after, size)),
         (dynamics_share(course.before), dynamics_share(course.after)),
-        (forecast(sides[0], held_out), forecast(sides[1], held_out)),
+        # As far ahead as the last model can go, however soon the declared one loses the readings.
+        (forecast(alike(course.before, course.after), held_out), forecast(course.after, held_out)),
         (0.0, more * float(np.log(course.after.count)) - gain),
         None if errors is None else (errors[0], errors[1]), truth,
         (sum(len(one.t) for one in course.after.data), recorded),
