@@ -273,8 +273,8 @@ def close(
             break
         unnamed = max((one.evidence for one in findings if not one.named), default=0.0)
         if doubted is not None:
-            # The second of two names: together they must do what the term without a name did alone.
-            if best.evidence + doubted.named < doubted.unnamed - EQUAL:
+            # The second of two names: together they must do clearly more than the term without a name did alone.
+            if best.evidence + doubted.named < doubted.unnamed + EQUAL:
                 rounds.append(Round(tuple(ranking)))
                 break
             doubted = None
