@@ -572,7 +572,7 @@ def _longest(change: Change, name: str, fitted: Fitted) -> float:
     times = fitted.data[0].t
     span, gap = float(times[-1] - times[0]), float(np.median(np.diff(times)))
     limits = {
-        "omega": 0.5 * np.pi / span, "delay": gap, "at": 2 * gap, "width": 0.3 * change.psi.get("width", 1.0), "s": 0.5,
+        "omega": 0.5 * np.pi / span, "delay": min(gap, 0.5 * change.psi.get("delay", gap)), "at": 2 * gap, "width": 0.3 * change.psi.get("width", 1.0), "s": 0.5,
         "scale": 0.5 * (1 + change.psi.get("scale", 0.0)),
     }  # fmt: skip
     return float(limits.get(name, np.inf))
