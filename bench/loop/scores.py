@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from bench.loop.specimen import NONE, OTHERS
+from bench.loop.trial import is_right
 from bench.provenance import lines
 from bench.tables import format_number
 from systems.errors import InputError
@@ -74,7 +75,8 @@ def kind(effect: str) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Give a row a trial."""
-    frame = pd.DataFrame(rows)
+    # Derived here, so that a run is judged by the rule as it stands now.
+    frame = pd.DataFrame([{**row, "right": _judged(row)} if row["status"] == "ok" else row for row in rows])
     for name in COLUMNS:
         if name not in frame:
             frame[name] = None
@@ -87,6 +89,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         .sort_values(["system", "effect", "z", "noise", "velocities", "seed"])
         .reset_index(drop=True)
     )
+
+
+def _judged(row: Mapping[str, Any]) -> bool:
+    effect = row["effect"]
+    wanted = [] if effect == NONE or effect in OTHERS else effect.split("+")
+    return is_right(wanted, row["named"], row["alike"], row["verdict"], effect)
 
 
 def summary(frame: pd.DataFrame) -> pd.DataFrame:

@@ -611,7 +611,7 @@ def _rounded(tangent: Tangent, effect: Effect) -> list[Try | None]:
 # What has no name -----------------------------------------------------------------------------------------------------------------
 
 REAL_TERMS = (
-    "u[n]*v[n]", "u[n]**4", "u[n]**6", "u[n]**7", "sin(u[n])", "sin(2*u[n])", "cos(u[n])", "cos(2*u[n])", "cos(3*u[n])",
+    "u[n]*v[n]", "u[n]**4", "u[n]**6", "u[n]**7", "sin(u[n])", "sin(2*u[n])", "cos(u[n])", "cos(2*u[n])",
     "abs(u[n])*u[n]", "t*u[n]", "t", "n*u[n]",
     "u[n+3]+u[n-3]-2*u[n]", "(u[n+1]-u[n])**2-(u[n-1]-u[n])**2", "u[n]**2*(u[n+1]+u[n-1])", "n*(u[n+1]+u[n-1]-2*u[n])",
     "t*(u[n+1]+u[n-1]-2*u[n])", "u[n]*(u[n+1]+u[n-1])",
@@ -623,7 +623,7 @@ SECOND_ORDER_TERMS = (
 COMPLEX_TERMS = (
     "u[n+1]+u[n-1]-2*u[n]", "abs(u[n])**6*u[n]", "conj(u[n])", "u[n]**2", "abs(u[n])**2", "u[n]**3", "u[n]*(abs(u[n+1])**2+abs(u[n-1])**2)",
     "abs(u[n+1])**2*u[n+1]+abs(u[n-1])**2*u[n-1]", "u[n]**2*conj(u[n+1]+u[n-1])", "t*u[n]", "n*(u[n+1]+u[n-1]-2*u[n])",
-    "t*(u[n+1]+u[n-1]-2*u[n])", "u[n]/(1+abs(u[n])**2)", "u[n]/(1+4*abs(u[n])**2)", "u[n+3]+u[n-3]-2*u[n]", "t*abs(u[n])**2*u[n]",
+    "t*(u[n+1]+u[n-1]-2*u[n])", "u[n]/(1+abs(u[n])**2)", "u[n+3]+u[n-3]-2*u[n]", "t*abs(u[n])**2*u[n]",
 )  # fmt: skip
 
 

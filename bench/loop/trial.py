@@ -235,19 +235,19 @@ def _made(trial: Made) -> dict[str, Any]:
     alike = [list(names) for names in found.course.equal]
     return {
         "size": one.z, "about": dict(one.about), "verdict": found.course.verdict, "named": named, "alike": alike,
-        "right": _right(wanted, named, alike, found.course.verdict, trial.effect),
+        "right": is_right(wanted, named, alike, found.course.verdict, trial.effect),
         "extra": max(len(named) - max(len(wanted), 1), 0) if wanted else len(named),
         **_errors(found, one.samples.sigma), "seconds": seconds, "cpu_seconds": cpu,
     }  # fmt: skip
 
 
-def _right(wanted: list[str], named: list[str], alike: list[list[str]], verdict: str, effect: str) -> bool:
+def is_right(wanted: list[str], named: list[str], alike: list[list[str]], verdict: str, effect: str) -> bool:
     """Whether the effect was named first or in the first group, of at most two; two effects in either order.
 
-    Without an effect nothing may be named; one from outside the catalogue must not be explained.
+    Without an effect nothing may be named; one from outside the catalogue must be seen, and not be explained.
     """
     if effect in specimen.OTHERS:
-        return verdict != "explained"
+        return verdict in ("unexplained", "partly explained")
     if not wanted:
         return not named
     groups = [{name, *others} if len(others) <= 1 else {name} for name, others in zip(named, alike, strict=True)]

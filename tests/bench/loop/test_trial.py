@@ -71,13 +71,14 @@ def test_a_run_continues_where_it_was_stopped_and_is_published(tmp_path: Path) -
     assert json.loads(json.dumps(rows)) == rows
 
 
-def test_a_name_in_a_group_of_three_is_not_right() -> None:
-    from bench.loop.trial import _right
+def test_a_name_in_a_group_of_three_is_notis_right() -> None:
+    from bench.loop.trial import is_right
 
-    assert _right(["damping"], ["damping"], [[]], "explained", "damping")
-    assert _right(["damping"], ["quadratic-drag"], [["damping"]], "explained", "damping")
-    assert not _right(["damping"], ["quadratic-drag"], [["damping", "memory"]], "explained", "damping")
-    assert not _right([], ["damping"], [[]], "explained", "none")
-    assert not _right([], ["damping"], [[]], "explained", "other: weak-bond")
-    assert _right([], ["damping"], [[]], "partly explained", "other: weak-bond")
-    assert _right(["damping", "drive"], ["drive", "damping"], [[], []], "explained", "damping+drive")
+    assert is_right(["damping"], ["damping"], [[]], "explained", "damping")
+    assert is_right(["damping"], ["quadratic-drag"], [["damping"]], "explained", "damping")
+    assert not is_right(["damping"], ["quadratic-drag"], [["damping", "memory"]], "explained", "damping")
+    assert not is_right([], ["damping"], [[]], "explained", "none")
+    assert not is_right([], ["damping"], [[]], "explained", "other: weak-bond")
+    assert is_right([], ["damping"], [[]], "partly explained", "other: weak-bond")
+    assert is_right(["damping", "drive"], ["drive", "damping"], [[], []], "explained", "damping+drive")
+    assert not is_right([], [], [], "nothing missing", "other: weak-bond")
