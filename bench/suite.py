@@ -8,7 +8,7 @@
 
     [defaults]                      # any key of a grid
     noise = [0.0, 0.01]
-    seeds = [1, 2, 3]
+    seeds = [1, 2, 3]               # or "1-100"
 
     [[grid]]                        # every combination of the lists is a case
     system = "phi4"                 # a name, or FILE.py / FILE.toml
@@ -23,6 +23,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,7 @@ from systems.lattice import Library, System, library
 from systems.toml import read_toml
 
 HERE = Path(__file__).parent / "suites"
+MOST_SEEDS = 10_000
 
 Number = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 Known = Literal["free", "fixed", "periodic", "antiperiodic"]
@@ -147,6 +149,16 @@ def _listed(value: Any) -> Any:
     return value if isinstance(value, list) else [value]
 
 
+def _seeds(value: Any) -> Any:
+    """Read "1-100" as the seeds from 1 to 100."""
+    if not isinstance(value, str):
+        return _listed(value)
+    found = re.fullmatch(r"\s*(\d{1,9})\s*-\s*(\d{1,9})\s*", value)
+    if found is None or not 0 <= int(found[2]) - int(found[1]) < MOST_SEEDS:
+        raise ValueError(f'write a range of at most {MOST_SEEDS} seeds as "1-100", the smaller one first')
+    return list(range(int(found[1]), int(found[2]) + 1))
+
+
 class _Contestant(_Model):
     method: str
     settings: dict[str, Any] = {}
@@ -173,7 +185,7 @@ class _Grid(_Model):
     noise: Annotated[list[float], pydantic.BeforeValidator(_listed)] = [0.0]
     missing: Annotated[list[float], pydantic.BeforeValidator(_listed)] = [0.0]
     mirror: Annotated[list[bool], pydantic.BeforeValidator(_listed)] = [False]
-    seeds: Annotated[list[int], pydantic.BeforeValidator(_listed)] = [1]
+    seeds: Annotated[list[int], pydantic.BeforeValidator(_seeds)] = [1]
     methods: list[str] | None = None
     time_limit: float = 120.0
     memory_limit: int = 4096

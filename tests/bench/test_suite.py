@@ -131,6 +131,17 @@ def test_the_key_of_a_case_covers_the_source_of_its_method_but_not_its_comments(
     assert case.key(tmp_path) != key
 
 
+def test_a_range_of_seeds_is_the_list_of_them(tmp_path: Path) -> None:
+    suite = load(write(tmp_path, SUITE.replace("seeds = [1, 2]", 'seeds = "3-5"')))
+    assert sorted({case.seed for case in suite.cases}) == [3, 4, 5]
+
+
+@pytest.mark.parametrize("text", ["5-3", "1-", "a-b", "1-99999", "-1-3", "1.5-2"])
+def test_what_is_no_range_of_seeds_is_refused_with_its_place(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError, match=r"seeds.*1-100"):
+        load(write(tmp_path, SUITE.replace("seeds = [1, 2]", f'seeds = "{text}"')))
+
+
 def test_the_key_of_a_case_does_not_depend_on_its_label_or_limits(tmp_path: Path) -> None:
     suite = load(write(tmp_path, SUITE))
     case = suite.cases[0]
