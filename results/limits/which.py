@@ -28,7 +28,16 @@ FEW = 3
 # A method serves where its median error is at most so many times the best one.
 SERVES = 1.25
 # The floor, the ceiling and the variants are no choices of their own.
-CONTESTANTS = ("trajectory", "trajectory-select", "splines", "weak", "pinn-vp", "sindy-tuned", "stlsq", "stlsq-differences")
+CONTESTANTS = (
+    "trajectory",
+    "trajectory-select",
+    "splines",
+    "weak",
+    "pinn-vp",
+    "sindy-tuned",
+    "stlsq",
+    "stlsq-differences",
+)
 FINE = ("trajectory", "splines", "weak")
 BASE = {"samples": 50, "sites": 31}
 COMPARED = 0.01
