@@ -554,10 +554,12 @@ def _run_trials(suite: str, jobs: int, results: Path | None, data: Path, as_json
 
     _, trials = load(suite)
     folder = results if results is not None else Path("runs") / Path(suite).stem
+    about = {"command": " ".join(["latticebench", *command_line()]), "suite": Path(suite).stem, "jobs": jobs}
+    # First, so that a run that is stopped says what it was.
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "about.txt", json.dumps(about) + "\n")
     with progress(len(trials)) as step:
         rows = run(trials, folder, jobs=jobs, data=data, watcher=step)
-    about = {"command": " ".join(["latticebench", *command_line()]), "suite": Path(suite).stem, "jobs": jobs}
-    write_text(folder / "about.txt", json.dumps(about) + "\n")
     _show_trials(folder, None, as_json)
     print(f"{len(rows)} diagnoses, kept in {folder}", file=sys.stderr)
 

@@ -30,6 +30,9 @@ FALSE_ALARM = 0.004
 EQUAL = 3.0
 # So much better must a term without a name be before no name is given.
 BETTER = 5.0
+# Terms without a name that are fitted in full beside the names in a round, and what share of their evidence in the screen they must have: what
+# is far off the declared equation is screened roughly.
+OTHER_FITS, OTHER_SHARE = 4, 0.6
 # How far behind the best an effect may be in the screen and still be fitted, where the readings are lost and the screen is rough.
 FAR = 20.0
 # Effects refitted in a round, at most.
@@ -98,6 +101,7 @@ class Course:
         rounds: the turns.
         left: what is significant in the last residual, the best first.
         verdict: "nothing missing", "explained", "partly explained" or "unexplained".
+        rival: what has no name and would do better in the last effect's place, and by how much (natural logarithms); or None.
     """
 
     before: Fitted
@@ -106,6 +110,7 @@ class Course:
     rounds: tuple[Round, ...]
     left: tuple[Finding, ...]
     verdict: str
+    rival: tuple[str, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +259,7 @@ def close(
     rounds: list[Round] = []
     equal: list[tuple[str, ...]] = []
     doubted: _Doubted | None = None
+    rival: tuple[str, float] | None = None
     left: tuple[Finding, ...] = ()
     while True:
         watcher(f"tracing what is left, round {len(rounds) + 1}")
@@ -266,24 +272,25 @@ def close(
             rounds.append(Round(tuple(_unfitted(findings))))
             break
         ranking = _contest(fitted, findings, watcher, 2 * EQUAL if horizon.follows(fitted) else FAR)
-        best = next((one for one in ranking if one.fitted is not None), None)
+        best = next((one for one in ranking if one.finding.named and one.fitted is not None), None)
         count = len(named)
         if best is None or best.fitted is None or best.p * count > FALSE_ALARM:
             rounds.append(Round(tuple(ranking)))
             break
-        unnamed = max((one.evidence for one in findings if not one.named), default=0.0)
+        found = _rival(ranking, best)
         if doubted is not None:
             # The second of two names: together they must do clearly more than the term without a name did alone.
             if best.evidence + doubted.named < doubted.unnamed + EQUAL:
                 rounds.append(Round(tuple(ranking)))
                 break
             doubted = None
-        elif unnamed > best.evidence + BETTER and horizon.sees_all(fitted):
-            doubted = _Doubted(fitted, tuple(equal), len(rounds), best.evidence, unnamed)
+        elif found[1] > BETTER and horizon.sees_all(fitted):
+            doubted = _Doubted(fitted, tuple(equal), len(rounds), best.evidence, best.evidence + found[1])
         alike = tuple(
             one.name for one in ranking
-            if one is not best and one.fitted is not None and one.evidence > best.evidence - EQUAL
+            if one is not best and one.finding.named and one.fitted is not None and one.evidence > best.evidence - EQUAL
         )  # fmt: skip
+        rival = found if found[1] > EQUAL and horizon.sees_all(fitted) else None
         rounds.append(Round(tuple(ranking), best.name, alike))
         fitted, equal = best.fitted, [*equal, alike]
         fitted, equal = _prune(fitted, equal)
@@ -298,12 +305,14 @@ def close(
     fitted, equal = _prune(fitted, equal, all_of_them=True)
     if len(fitted.model.changes) > 1:
         fitted, equal, left = _reconsider(fitted, equal, left, horizon, catalogue, draw, surrogates, watcher)
+    if not fitted.model.changes:
+        rival = None
     verdict = (
-        ("partly explained" if left else "explained")
+        ("partly explained" if left or rival else "explained")
         if fitted.model.changes
         else ("unexplained" if left else "nothing missing")
     )
-    return Course(before, fitted, tuple(equal), tuple(rounds), left, verdict)
+    return Course(before, fitted, tuple(equal), tuple(rounds), left, verdict, rival)
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,15 +456,17 @@ def _contest(
 ) -> list[Candidate]:
     """Fit the best few effects in full and rank all."""
     ranking: list[Candidate] = []
-    best, fits = 0.0, 0
+    best, screened, fits, others = 0.0, 0.0, 0, 0
     for one in findings:
         # Other ends change the motion by more than to first order.
         near = one.evidence > best - window or (one.change.ends is not None and one.evidence > EQUAL)
-        if not one.named or not near or fits >= FULL_FITS:
+        # A term without a name is measured as the names are, where the screen puts it beside them.
+        if not one.named:
+            near = bool(one.change.texts) and one.evidence > OTHER_SHARE * screened and others < OTHER_FITS
+        if not near or fits >= FULL_FITS:
             ranking.append(Candidate(one, one.gain, one.evidence, one.p))
             continue
         watcher(f"fitting {one.name}")
-        fits += 1
         with_it = polish(fitted.model.with_change(one.change), fitted)
         if with_it is None:
             ranking.append(Candidate(one, 0.0, 0.0, 1.0))
@@ -464,8 +475,21 @@ def _contest(
         # Of a random effect the evidence is that of its variance: a fit has as many coefficients as there are sites.
         again = one if one.random or "step" in one.change.psi else replace(one, gain=gain)
         ranking.append(Candidate(one, gain, again.evidence, again.p, with_it))
-        best = max(best, again.evidence)
+        if one.named:
+            fits, best, screened = fits + 1, max(best, again.evidence), max(screened, one.evidence)
+        else:
+            others += 1
     return sorted(ranking, key=lambda one: -one.evidence)
+
+
+def _rival(ranking: Sequence[Candidate], best: Candidate) -> tuple[str, float]:
+    """Find what has no name and does best beside the best name, and by how much it is ahead; full fits are compared with full fits."""
+    found = ("", -np.inf)
+    for one in ranking:
+        if not one.finding.named:
+            lead = one.evidence - (best.evidence if one.fitted is not None else best.finding.evidence)
+            found = max(found, (one.name, float(lead)), key=lambda pair: pair[1])
+    return found
 
 
 def polish(model: Model, start: Fitted) -> Fitted | None:
@@ -483,7 +507,8 @@ def polish(model: Model, start: Fitted) -> Fitted | None:
             free = change.free
             end = begin + len(free)
             size = np.array([_longest(change, name, fitted) for name in free])
-            move = np.clip(step[begin:end], -size, size)
+            least = np.array([_least(change, name, fitted) for name in free])
+            move = np.maximum(np.clip(step[begin:end], -size, size), least)
             with np.errstate(divide="ignore", invalid="ignore"):
                 largest = max(
                     largest, float(np.max(np.nan_to_num(np.abs(step[begin:end]) / error[begin:end]), initial=0.0))
@@ -578,6 +603,14 @@ def _longest(change: Change, name: str, fitted: Fitted) -> float:
     return float(limits.get(name, np.inf))
 
 
+def _least(change: Change, name: str, fitted: Fitted) -> float:
+    """How far down a parameter may move in one step: what has less than a whole wave in the record is no wave."""
+    if name != "omega":
+        return -np.inf
+    span = max(float(one.t[-1]) for one in fitted.data) - min(float(one.t[0]) for one in fitted.data)
+    return 2 * np.pi / span - change.psi["omega"]
+
+
 def _prune(
     fitted: Fitted, equal: list[tuple[str, ...]], *, all_of_them: bool = False
 ) -> tuple[Fitted, list[tuple[str, ...]]]:
@@ -620,7 +653,7 @@ def _reconsider(
         ranking = _contest(
             smaller, screen(linearise(smaller), catalogue, draw, surrogates), watcher, max(2 * EQUAL, margin)
         )
-        tried = [one for one in ranking if one.fitted is not None]
+        tried = [one for one in ranking if one.finding.named and one.fitted is not None]
         if not tried:
             continue
         best = tried[0]

@@ -17,7 +17,7 @@ import numpy as np
 
 from bench.equation import side
 from bench.loop.model import Change, Fitted
-from bench.loop.trace import step_of
+from bench.loop.ways import step_of
 from systems.effects import INSTRUMENT, Effect
 from systems.terms import Term
 
@@ -190,6 +190,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             for name, place in (("before", whereabouts(course.before, diagnosis)), ("after", whereabouts(course.after, diagnosis)))
         },
         "left": [{"effect": one.name, "p": one.p, "named": one.named} for one in course.left],
+        "rival": None if course.rival is None else {"name": course.rival[0], "lead": course.rival[1]},
         "notes": notes(diagnosis),
     }  # fmt: skip
     found: dict[str, Any] = finite(whole)
@@ -413,6 +414,11 @@ def notes(diagnosis: Diagnosis) -> list[str]:
     if unnamed and course.verdict in ("unexplained", "partly explained"):
         listed = ", ".join(one.name for one in unnamed[:3])
         found.append(f"What would do most for what is left, though it is no effect of the catalogue: {listed}.")
+    if course.rival is not None:
+        found.append(
+            f"{course.rival[0]} would do better by {course.rival[1]:.1f} (natural logarithms of the likelihood ratio) in the place of the last "
+            "effect, though it is no effect of the catalogue: the name is in doubt."
+        )
     clock = [change for change in course.after.model.changes if change.effect.acts == "clock"]
     if clock:
         found.append(

@@ -21,10 +21,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLUMNS = (
-    "system", "effect", "z", "noise", "velocities", "seed", "status", "verdict", "named", "alike", "right", "extra",
-    "residual_before", "residual_after", "forecast_before", "forecast_after", "coefficients_before", "coefficients_after",
+    "system", "effect", "z", "noise", "velocities", "seed", "status", "size", "apart", "verdict", "named", "alike", "right", "extra",
+    "residual_before", "residual_after", "forecast_before", "forecast_after", "forecast_true", "coefficients_before", "coefficients_after",
     "seconds", "cpu_seconds", "message",
 )  # fmt: skip
+# From here on what no single effect of the catalogue can do is visible beside the best one (in units of its standard error).
+APART = 5.0
+TRUE_TIMES = 1.5
 
 
 def is_run(folder: Path) -> bool:
@@ -64,12 +67,16 @@ def about(rows: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, Any]:
     return {**described, "seeds": seeds or [1]}
 
 
-def kind(effect: str) -> str:
-    """Sort trials into four kinds."""
+def kind(effect: str, apart: float) -> str:
+    """Sort trials into kinds; one from outside the catalogue that an effect of it comes near could be told from it by nobody."""
     if effect == NONE:
         return "nothing missing"
     if effect in OTHERS:
-        return "outside the catalogue"
+        return (
+            f"outside the catalogue, {APART:g} or more from it"
+            if apart >= APART
+            else f"outside the catalogue, less than {APART:g} from it"
+        )
     return "two at once" if "+" in effect else "one effect"
 
 
@@ -99,7 +106,9 @@ def _judged(row: Mapping[str, Any]) -> bool:
 
 def summary(frame: pd.DataFrame) -> pd.DataFrame:
     """Give, for each kind of trial, how often the diagnosis was right, and the errors before and after (medians)."""
-    ran = frame[frame["status"] == "ok"].assign(kind=lambda f: [kind(effect) for effect in f["effect"]])
+    ran = frame[frame["status"] == "ok"].assign(
+        kind=lambda f: [kind(effect, apart) for effect, apart in zip(f["effect"], f["apart"], strict=True)]
+    )
     found = []
     for names, group in ran.groupby(["kind", "z", "noise", "velocities"], sort=True):
         found.append(_line(dict(zip(("kind", "z", "noise", "velocities"), names, strict=True)), group))
@@ -115,8 +124,17 @@ def _line(head: dict[str, Any], group: pd.DataFrame) -> dict[str, Any]:
     )}  # fmt: skip
     return {
         **head, "trials": len(group), "right": float(group["right"].astype(float).mean()),
-        "effects too many": float((group["extra"].astype(float) > 0).mean()), **values,
+        "effects too many": float((group["extra"].astype(float) > 0).mean()), **values, **_ahead(group),
     }  # fmt: skip
+
+
+def _ahead(group: pd.DataFrame) -> dict[str, float]:
+    """Compare forecasts with those of the true model fitted to the same data: the median ratio, and the share of at most TRUE_TIMES."""
+    ratio = (group["forecast_after"].astype(float) / group["forecast_true"].astype(float)).dropna()
+    return {
+        "forecast over that of the true model": float(ratio.median()) if len(ratio) else float("nan"),
+        f"at most {TRUE_TIMES:g} times that": float((ratio <= TRUE_TIMES).mean()) if len(ratio) else float("nan"),
+    }
 
 
 def by_effect(frame: pd.DataFrame) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 They are made apart from the loop: plain NumPy forces beside the system's own right-hand side, SciPy's integrators, and the
 instrument's faults put on afterwards. Sizes are asked for as z, the effect's size over the smallest standard error that it could be
 known with (the Cramer-Rao bound, everything in the declared equation being unknown too): z = 5 is barely visible, 30 plainly.
+Beyond first order this is what the declared equation leaves of the clean readings when it is fitted to them, in units of the noise.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.loop.model import Fitted, Model, rounding_error
-from bench.loop.tangent import linearise
+from bench.loop.model import Fitted, Model, refit, rounding_error
+from bench.loop.tangent import Tangent, linearise
+from bench.loop.ways import ways
 from methods.trajectory import Solution, State
 from systems.effects import CATALOGUE, find
 from systems.errors import InputError, unknown
@@ -43,6 +45,8 @@ class Specimen:
         amount: its coefficient (one complex number where there are two).
         about: site, frequency and the like.
         z: its size over the smallest standard error.
+        ends: the other ends that the chain has, where they are what is wrong.
+        apart: for an effect from outside the catalogue, how much of z the nearest one of the catalogue leaves; else 0.
     """
 
     samples: SimulatedSamples
@@ -51,6 +55,8 @@ class Specimen:
     amount: complex
     about: Mapping[str, float]
     z: float
+    apart: float = 0.0
+    ends: Ends | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +69,8 @@ class Drawn:
         n: place of each site, counted from the chain's middle (N,).
         far: long-range coupling of the sites (N, N).
         bond: one bond's force (N, N).
+        bonds: the forces of bonds that are all different (N, N).
+        shape: wave numbers and phases of a drawn function (2, 3).
         each: a number for each site (N,).
         omegas, phases: of five waves at each site (5, N).
         late: how late each row is read, in units of the jitter (T,), or None.
@@ -73,6 +81,8 @@ class Drawn:
     n: Float[ndarray, " sites"]
     far: Float[ndarray, "sites sites"]
     bond: Float[ndarray, "sites sites"]
+    bonds: Float[ndarray, "sites sites"]
+    shape: Float[ndarray, "two waves"]
     each: Float[ndarray, " sites"]
     omegas: Float[ndarray, "waves sites"]
     phases: Float[ndarray, "waves sites"]
@@ -117,6 +127,10 @@ class Moment:
         """Give the drive's harmonic."""
         about = self.drawn.about
         return float(np.cos(about["omega"] * self.t + about["phase"]))
+
+    def waves(self, x: ndarray) -> ndarray:
+        """Give a drawn smooth function of a number at each site: three waves."""
+        return np.asarray(np.sum(np.cos(self.drawn.shape[0] * x[:, None] + self.drawn.shape[1]), axis=1))
 
     def pulse(self) -> float:
         """Give the bell-shaped pulse."""
@@ -166,15 +180,24 @@ PUSHES: dict[str, Callable[[Moment], ndarray]] = {
     "other: weak-bond": lambda m: m.drawn.bond @ m.u,
     "other: noise-force": lambda m: np.sum(np.cos(m.drawn.omegas * m.t + m.drawn.phases), axis=0),
     "other: saturation": lambda m: m.u / (1 + 4 * np.abs(m.u) ** 2) if m.chain.is_complex else np.cos(3 * m.u),
+    # Nothing of the catalogue, and of a form that is drawn, so that no list of terms can hold it.
+    "other: wavy-force": lambda m: m.waves(np.abs(m.u)) * (m.u if m.chain.is_complex else 1),
+    "other: wavy-drag": lambda m: -m.waves(np.abs(m.v)) * m.v,
+    "other: wavy-bonds": lambda m: sum(m.waves(np.abs(m.stretch(k))) * m.stretch(k) for k in (-1, 1)),
+    "other: uneven-bonds": lambda m: m.drawn.bonds @ m.u,
+    "other: sudden-coupling": lambda m: float(m.t > m.drawn.about["at"]) * (m.stretch(1) + m.stretch(-1)),
+    "other: late-push": lambda m: float(m.t > m.drawn.about["at"]) * np.eye(len(m.u))[m.drawn.site],
 }
 
-ONLY_SECOND = ("other: cubic-drag", "other: friction-between")
+ONLY_SECOND = ("other: cubic-drag", "other: friction-between", "other: wavy-drag")
 READINGS = ("sensor-offset", "sensor-gain", "sensor-curve", "clock", "quantisation")
 OTHERS = tuple(name for name in PUSHES if name.startswith("other: "))
 # Effects of complex fields whose size is a real number all the same.
 REAL = ("damping", "nonlinear-loss", "gain-loss", "disorder", "unequal-masses", "ends", *READINGS)
 # Without a size of their own.
 FIXED = ("ends", "quantisation")
+# Steps to the amount of an effect that has the size: to first order, then with the declared equation fitted, to within CLOSE.
+FIRST_ORDER, REFITS, CLOSE = 6, 6, 0.1
 MADE = (NONE, *PUSHES, *READINGS, "ends", "unequal-masses", "known-input", "memory")
 
 
@@ -238,9 +261,9 @@ def make(
 
     names = [] if name == NONE else name.split("+")
     amounts: list[complex] = []
-    (u, v), size = plain, 0.0
+    (u, v), size, apart = plain, 0.0, 0.0
     if names:
-        visible = _measure(system, plain, times, sizes, chain)
+        sight = _sight(system, plain, times, sizes, chain)
         for one in names:
             direction: complex = 1.0
             if system.is_complex and one not in REAL:
@@ -254,9 +277,10 @@ def make(
             elif one in FIXED:
                 amounts.append(1.0)
             else:
-                amounts.append(_sized(readings, visible, z, direction, float(np.sqrt(np.mean(np.abs(plain[0]) ** 2)))))
+                amounts.append(_sized(readings, sight, z, direction, float(np.sqrt(np.mean(np.abs(plain[0]) ** 2)))))
             u, v = readings(amounts[-1])
-            size = z if one == "quantisation" else visible((u, v))
+            size = z if one == "quantisation" else sight.fitted_size((u, v))
+            apart = sight.apart((u, v)) if one in OTHERS else 0.0
         if len(names) > 1:
             u, v = _run(chain, start, times, _all(names, amounts, chain, drawn))
     amount = amounts[0] if amounts else 0.0
@@ -270,27 +294,33 @@ def make(
         times, noisy, noisy_v, drawn.force, sigma=sizes[0] * np.sqrt(chain.parts), source=f"{system.name} with {name}",
         equation=chain.term.text, exact=clean, noise=noise,
     )  # fmt: skip
-    return Specimen(observed, clean, name, amount, drawn.about, size)
+    return Specimen(
+        observed, clean, name, amount, drawn.about, size, apart, _other(chain.ends) if name == "ends" else None
+    )
 
 
-def _sized(
-    clean: Callable[[complex], Fields], visible: Callable[[Fields], float], z: float, direction: complex, scale: float
-) -> complex:
+def _sized(readings: Callable[[complex], Fields], sight: _Sight, z: float, direction: complex, scale: float) -> complex:
     """Find the amount that is visible with the size z.
 
     Raises:
         InputError: no amount is visible.
     """
-    trial = 1e-6 * scale
-    for count in range(20):
-        size = visible(clean(trial * direction))
+    amount = 1e-6 * scale
+    # To first order, from an amount so small that it is one.
+    for _ in range(FIRST_ORDER):
+        size = sight.size(readings(amount * direction))
         if not size > 0:
             raise InputError("an effect of no size is visible here")
-        if abs(size / z - 1) < (1e-6 if count < 6 else 0.02):
+        if abs(size / z - 1) < 1e-6:
             break
-        # Large sizes may be far from linear; what does not settle is approached by smaller steps.
-        trial *= float(np.clip((z / size) ** (1.0 if count < 6 else 0.5), 0.2, 1e5))
-    return trial * direction
+        amount *= float(np.clip(z / size, 0.2, 1e5))
+    # A large effect may be absorbed by the declared equation's own coefficients, or by a motion of another kind.
+    for _ in range(REFITS):
+        size = sight.fitted_size(readings(amount * direction))
+        if abs(size / z - 1) < CLOSE:
+            break
+        amount *= float(np.clip((z / max(size, 1e-12)) ** 0.8, 0.3, 3.0))
+    return amount * direction
 
 
 def _all(
@@ -367,7 +397,11 @@ def _drawn(name: str, sites: int, times: ndarray, draw: np.random.Generator) -> 
         force = np.cumsum(draw.normal(size=(len(times), sites)), axis=0)
         force -= force.mean(axis=0)
         force /= np.std(force)
-    return Drawn(about, n, far - np.diag(far.sum(axis=1)), bond, each, omegas, phases, late, force)
+    strengths = draw.normal(size=sites - 1)
+    bonds = np.diag(strengths, 1) + np.diag(strengths, -1)
+    bonds -= np.diag(bonds.sum(axis=1))
+    shape = np.stack([draw.uniform(1.0, 5.0, size=3), draw.uniform(0, 2 * np.pi, size=3)])
+    return Drawn(about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force)
 
 
 def _run(
@@ -411,12 +445,16 @@ def _disturbed(name: str, amount: complex, chain: Motion, start: ndarray, times:
     if name == "memory":
         return _with_memory(amount, chain, start, times, float(drawn.about["delay"]))
     if name == "ends":
-        other: Ends = "fixed" if chain.ends == "free" else "free"
-        return _run(replace(chain, ends=other), start, times, None)
+        return _run(replace(chain, ends=_other(chain.ends)), start, times, None)
     if name == "clock":
         assert drawn.late is not None
         return _read_late(chain, start, times, float(np.real(amount)) * drawn.late)
     return _misread(name, float(np.real(amount)), drawn.site, *_run(chain, start, times, None))
+
+
+def _other(ends: Ends) -> Ends:
+    """Give the ends that a chain has instead of its own."""
+    return "fixed" if ends == "free" else "free"
 
 
 def _scaled(chain: Motion, site: int, amount: float) -> Callable[[float, ndarray, ndarray], ndarray]:
@@ -478,10 +516,64 @@ def _with_memory(amount: complex, chain: Motion, start: ndarray, times: ndarray,
     return chain.unpack(np.stack([rows[float(t)] for t in times], axis=1))
 
 
-def _measure(
-    system: System, plain: Fields, times: ndarray, sizes: list[float], chain: Motion
-) -> Callable[[Fields], float]:
-    """Make the function that says how visible a change of the readings is beside the declared equation's unknowns."""
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """What can be seen of a change of the readings beside the declared equation's unknowns, to first order.
+
+    Attributes:
+        plain: the clean readings without it.
+        tangent: of the declared equation at its true coefficients.
+        chain: the chain.
+        levels: 1 where only u is read, else 2.
+    """
+
+    plain: Fields
+    tangent: Tangent
+    chain: Motion
+    levels: int
+
+    def left(self, found: Fields) -> Float[ndarray, " rows"]:
+        """Give the change in units of the noise, without what the declared equation's unknowns can do."""
+        changes = [
+            one - exact for one, exact in zip(found, self.plain, strict=True) if one is not None and exact is not None
+        ]
+        parts = [np.stack([f.real, f.imag] if self.chain.is_complex else [f], axis=1) for f in changes[: self.levels]]
+        path = self.tangent.paths[0]
+        return self.tangent.new(path.free(path.rows(np.stack(parts, axis=1)[None])))[:, 0]
+
+    def size(self, found: Fields) -> float:
+        """Give the length of that: the size of a small change over the smallest standard error that it could be known with."""
+        return float(np.linalg.norm(self.left(found)))
+
+    def refitted(self, found: Fields) -> Fitted:
+        """Fit the declared equation to clean readings."""
+        u, v = found
+        fitted = self.tangent.fitted
+        clean = replace(fitted.data[0], u=u, v=v if self.levels > 1 else None)
+        again = refit(fitted.model, [clean], fitted.solution.state)
+        return replace(again, solution=replace(again.solution, sigma=fitted.sigma))
+
+    def fitted_size(self, found: Fields) -> float:
+        """Give the size of a change that need not be small: what the declared equation leaves when it is fitted to the clean readings."""
+        fitted = self.refitted(found)
+        return float(np.linalg.norm(fitted.residuals()[0] / fitted.sigma[:, None, None]))
+
+    def apart(self, found: Fields) -> float:
+        """Give what the nearest single effect of the catalogue, of any amount, leaves of that.
+
+        Effects with a coefficient for every site or time, that come near anything, are not counted.
+        """
+        tangent = linearise(self.refitted(found))
+        left, near = tangent.residual, 0.0
+        for effect in CATALOGUE:
+            for one in ways(tangent, effect):
+                if one.spread is None:
+                    near = max(near, float(np.sum((one.basis.T @ left) ** 2)))
+        return float(np.sqrt(max(left @ left - near, 0.0)))
+
+
+def _sight(system: System, plain: Fields, times: ndarray, sizes: list[float], chain: Motion) -> _Sight:
+    """Linearise the declared equation about the motion without an effect."""
     declared = system.library("equation")
     truth = system.truth(declared, {})
     assert truth is not None
@@ -493,14 +585,4 @@ def _measure(
     sigma = np.array(sizes)
     covariance, counts = np.eye(len(truth)), np.ones(len(sizes))
     solution = Solution(State(truth, (nodes,), (None,)), sigma, covariance, sigma**2, counts, 1, True, ())
-    tangent = linearise(Fitted(model, (samples,), tuple(records), solution))
-    path = tangent.paths[0]
-
-    def visible(found: Fields) -> float:
-        changes = [
-            one - exact for one, exact in zip(found, plain, strict=True) if one is not None and exact is not None
-        ]
-        levels = [np.stack([f.real, f.imag] if chain.is_complex else [f], axis=1) for f in changes[: len(sizes)]]
-        return float(np.linalg.norm(tangent.new(path.free(path.rows(np.stack(levels, axis=1)[None])))))
-
-    return visible
+    return _Sight(plain, linearise(Fitted(model, (samples,), tuple(records), solution)), chain, len(sizes))

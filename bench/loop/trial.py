@@ -34,12 +34,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import pydantic
+from threadpoolctl import threadpool_limits
 
 import systems
 from bench.loop import specimen
-from bench.loop.repair import Diagnosis, diagnose
+from bench.loop.model import Change
+from bench.loop.repair import Diagnosis, diagnose, polish
+from bench.loop.residual import alike, forecast, pooled
+from bench.loop.specimen import Specimen
+from bench.loop.tangent import linearise
+from bench.loop.ways import ways
 from bench.provenance import origin
-from systems.effects import CATALOGUE
+from systems.effects import CATALOGUE, find
 from systems.errors import InputError, unknown
 from systems.files import write_text
 from systems.lattice import Ends, library
@@ -53,6 +59,7 @@ HERE = Path(__file__).parent / "suites"
 # A recording whose effect could not be given its size (it is as good as invisible) is no trial.
 OFF_SIZE = 0.2
 OWN_SIZE = ("ends", "quantisation")
+KNOWN = tuple(effect.name for effect in CATALOGUE)
 
 
 class _Model(pydantic.BaseModel):
@@ -230,15 +237,40 @@ def _made(trial: Made) -> dict[str, Any]:
         truth=system.truth(declared, {}),
     )  # fmt: skip
     seconds, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    own = _forecast_of_truth(one, found) if trial.effect in KNOWN else None
     named = [change.effect.name for change in found.course.after.model.changes]
     wanted = [] if trial.effect == specimen.NONE or trial.effect in specimen.OTHERS else trial.effect.split("+")
     alike = [list(names) for names in found.course.equal]
     return {
-        "size": one.z, "about": dict(one.about), "verdict": found.course.verdict, "named": named, "alike": alike,
+        "size": one.z, "apart": one.apart, "about": dict(one.about), "verdict": found.course.verdict, "named": named, "alike": alike,
         "right": is_right(wanted, named, alike, found.course.verdict, trial.effect),
         "extra": max(len(named) - max(len(wanted), 1), 0) if wanted else len(named),
-        **_errors(found, one.samples.sigma), "seconds": seconds, "cpu_seconds": cpu,
+        **_errors(found, one.samples.sigma), "forecast_true": own, "seconds": seconds, "cpu_seconds": cpu,
     }  # fmt: skip
+
+
+def _forecast_of_truth(one: Specimen, found: Diagnosis) -> float | None:
+    """Give the error of forecasts by the true model, fitted to the same data; None where it cannot be set up.
+
+    Its effect is put at the place and with the frequency, delay and so on that it was made with; these and its coefficients are then fitted.
+    """
+    course = found.course
+    before = alike(course.before, course.after)
+    near = [way.change for way in ways(linearise(before), find(one.effect)) if not way.change.as_force]
+    if not near:
+        return None
+
+    def distance(change: Change) -> tuple[Any, ...]:
+        away = sum(abs(value - one.about[name]) for name, value in change.psi.items() if name in one.about)
+        place = change.site not in (None, int(one.about["site"]))
+        # What was made has faults of u and v alike, jitter rather than a slow clock, and these other ends.
+        return place, change.site is None, change.ends != one.ends, not change.both, away, -len(change.psi)
+
+    chosen = min(near, key=distance)
+    true = chosen.moved({name: float(one.about[name]) for name in chosen.psi if name in one.about})
+    with threadpool_limits(1):
+        fitted = polish(before.model.with_change(true), before)
+        return None if fitted is None else pooled(forecast(fitted))
 
 
 def is_right(wanted: list[str], named: list[str], alike: list[list[str]], verdict: str, effect: str) -> bool:

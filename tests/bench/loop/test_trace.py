@@ -13,7 +13,8 @@ from bench.loop import trace
 from bench.loop.model import Model, first_fit
 from bench.loop.specimen import make
 from bench.loop.tangent import linearise
-from bench.loop.trace import Finding, rank, rarity, screen, step_of, tail
+from bench.loop.trace import Finding, rank, rarity, screen, tail
+from bench.loop.ways import step_of, ways
 from systems.effects import CATALOGUE, find
 
 SMALL = {"sites": 9, "samples": 30, "span": 6.0}
@@ -90,7 +91,7 @@ DRAWS = 150
 @pytest.mark.parametrize("name", PLAIN)
 def test_on_noise_alone_an_effect_is_as_rare_as_its_p_says(name):
     tangent, _ = tangent_of(name, "none", 0, 0)
-    groups = [(effect, True, trace._tries(tangent, find(effect))) for effect in (*PLAIN[name], "disorder")]
+    groups = [(effect, True, ways(tangent, find(effect))) for effect in (*PLAIN[name], "disorder")]
     assert all(tries for _, _, tries in groups)
     draw = np.random.default_rng(11)
     found = {effect: [] for effect, _, _ in groups}
@@ -112,7 +113,7 @@ def test_on_noise_alone_an_effect_is_as_rare_as_its_p_says(name):
 def test_an_effect_that_the_equation_has_already_is_not_tried():
     tangent, _ = tangent_of("phi4", "none", 0, 0)
     for name in ("onsite-linear", "onsite-cubic"):
-        assert trace._tries(tangent, find(name)) == []
+        assert ways(tangent, find(name)) == []
     names = [one.name for one in screen(tangent, CATALOGUE, np.random.default_rng(0), 20)]
     assert not {"onsite-linear", "onsite-cubic", "known-input", "nonlinear-loss"} & set(names)
     assert {"damping", "drive", "defect", "ends", "sensor-offset"} <= set(names)
@@ -187,11 +188,11 @@ def test_rounded_readings_are_named_and_finely_rounded_ones_are_not():
     from bench.loop.specimen import _rounded
 
     tangent, _ = tangent_of("phi4", "quantisation", 20, 0)
-    assert trace._tries(tangent, find("quantisation"))
+    assert ways(tangent, find("quantisation"))
     system = systems.find("phi4")
     specimen = make(system, "none", 0, np.random.default_rng(0), **SMALL)
     samples = replace(
         specimen.samples.observed(), u=_rounded(specimen.samples.u, 0.1 * specimen.samples.sigma), ends=system.ends
     )
     fine = linearise(first_fit(Model(system.library("equation"), 2), [samples]))
-    assert trace._tries(fine, find("quantisation")) == []
+    assert ways(fine, find("quantisation")) == []

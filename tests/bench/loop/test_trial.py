@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bench.loop import scores
-from bench.loop.trial import Made, Measured, is_suite, load, names, run
+from bench.loop.trial import Made, Measured, _made, is_suite, load, names, run
 from systems.effects import CATALOGUE
 from systems.errors import InputError
 
@@ -82,3 +82,15 @@ def test_a_name_in_a_group_of_three_is_notis_right() -> None:
     assert is_right([], ["damping"], [[]], "partly explained", "other: weak-bond")
     assert is_right(["damping", "drive"], ["drive", "damping"], [[], []], "explained", "damping+drive")
     assert not is_right([], [], [], "nothing missing", "other: weak-bond")
+
+
+def test_what_an_effect_of_the_catalogue_could_do_as_well_is_counted_apart() -> None:
+    assert scores.kind("other: cubic-drag", 1.0) != scores.kind("other: cubic-drag", 9.0)
+    assert scores.kind("damping", 0.0) == "one effect"
+
+
+@pytest.mark.parametrize("effect", ["drive", "sensor-gain", "ends", "unequal-masses"])
+def test_where_the_right_effect_is_named_forecasts_are_those_of_the_true_model(effect: str) -> None:
+    row = _made(Made(system="phi4", effect=effect, z=30.0, sites=9, samples=30))
+    assert row["named"] == [effect]
+    assert row["forecast_after"] == pytest.approx(row["forecast_true"], rel=0.02)

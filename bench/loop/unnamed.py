@@ -1,0 +1,238 @@
+"""Ways for something without a name to be there, that compete with the catalogue's effects.
+
+- Single terms that physicists use and the catalogue lacks; they can be fitted in full.
+- Smooth functions of one variable, whatever their form: a force that depends on the field, on the velocity, on a spring's stretch; a declared term that changes
+  in time or from site to site. They are random effects of unknown variance (`bench.loop.trace`).
+- Smooth forces in space and time, and patterns of the residual itself: nets for whatever else there is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.loop.model import Change, Force
+from bench.loop.tangent import Path, Tangent, force_along
+from bench.loop.ways import Try, attempt, places, too_wide
+from systems.effects import Effect
+from systems.terms import Term
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+REAL_TERMS = (
+    "u[n]*v[n]", "u[n]**4", "u[n]**6", "u[n]**7", "sin(u[n])", "sin(2*u[n])", "cos(u[n])", "cos(2*u[n])",
+    "abs(u[n])*u[n]", "t*u[n]", "t", "n*u[n]",
+    "u[n+3]+u[n-3]-2*u[n]", "(u[n+1]-u[n])**2-(u[n-1]-u[n])**2", "u[n]**2*(u[n+1]+u[n-1])", "n*(u[n+1]+u[n-1]-2*u[n])",
+    "t*(u[n+1]+u[n-1]-2*u[n])", "u[n]*(u[n+1]+u[n-1])",
+)  # fmt: skip
+SECOND_ORDER_TERMS = (
+    "v[n]**3", "u[n]**2*v[n]", "u[n]*v[n]**2", "n*v[n]", "t*v[n]", "v[n+1]+v[n-1]-2*v[n]", "(v[n+1]-v[n-1])/2",
+    "sqrt(abs(v[n]))*sign(v[n])",
+)  # fmt: skip
+COMPLEX_TERMS = (
+    "u[n+1]+u[n-1]-2*u[n]", "abs(u[n])**6*u[n]", "conj(u[n])", "u[n]**2", "abs(u[n])**2", "u[n]**3", "u[n]*(abs(u[n+1])**2+abs(u[n-1])**2)",
+    "abs(u[n+1])**2*u[n+1]+abs(u[n-1])**2*u[n-1]", "u[n]**2*conj(u[n+1]+u[n-1])", "t*u[n]", "n*(u[n+1]+u[n-1]-2*u[n])",
+    "t*(u[n+1]+u[n-1]-2*u[n])", "u[n]/(1+abs(u[n])**2)", "u[n+3]+u[n-3]-2*u[n]", "t*abs(u[n])**2*u[n]",
+)  # fmt: skip
+# Chebyshev polynomials of a smooth function, and half waves of what changes in time.
+DEGREES, HALF_WAVES = 12, 6
+MODES = 6
+
+Group = tuple[str, list[Try]]
+
+
+def unnamed(tangent: Tangent) -> list[Group]:
+    """List all of them by what they are called in a ranking."""
+    return [*_terms(tangent), *_bonds(tangent), *_functions(tangent), *_nets(tangent)]
+
+
+def _parts(path: Path) -> tuple[str, ...]:
+    """Give the factors of a term: a complex field's coefficients are complex."""
+    return ("", "i*") if path.is_complex else ("",)
+
+
+def _terms(tangent: Tangent) -> list[Group]:
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    real = REAL_TERMS + (SECOND_ORDER_TERMS if dynamics.order == 2 else ())
+    texts: tuple[str, ...] = COMPLEX_TERMS if dynamics.is_complex else real
+    kept = [
+        (text, f"i*({text})") if dynamics.is_complex else (text,)
+        for text in texts
+        if not too_wide(Term(text), dynamics)
+    ]
+
+    def columns(_number: int, path: Path) -> ndarray:
+        return path.answer(force_along(path, [Force(Term(text)) for group in kept for text in group]))
+
+    every = tangent.columns(columns)
+    found = []
+    for k, group in enumerate(kept):
+        each = len(group)
+        one = attempt(tangent, Change(Effect("unnamed", group[0]), group), every[:, k * each : (k + 1) * each])
+        if one is not None:
+            found.append((group[0], [one]))
+    return found
+
+
+def _bonds(tangent: Tangent) -> list[Group]:
+    """Give one bond of another strength, and every bond of its own."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    moving = places(tangent)
+    left_ones = [k for k in moving if k + 1 in moving]
+    if len(left_ones) < 2:
+        return []
+    parts = _parts(tangent.paths[0])
+
+    def columns(_number: int, path: Path) -> ndarray:
+        terms = [Term(f"{part}(u[n+1]-u[n])") for part in parts] + [Term(f"{part}(u[n-1]-u[n])") for part in parts]
+        right, left = np.split(path.sources(terms), 2)
+        sites = np.eye(dynamics.sites)[:, dynamics.moving]
+        return path.answer(np.concatenate([right * sites[k] + left * sites[k + 1] for k in left_ones]))
+
+    every = tangent.columns(columns)
+    change = Change(Effect("unnamed", "u[n+1]-u[n]"))
+    each = len(parts)
+    tries = [attempt(tangent, change, every[:, j * each : (j + 1) * each]) for j in range(len(left_ones))]
+    return [
+        *_group("another bond", tries),
+        *_group("uneven bonds", [attempt(tangent, change, every, random=True)]),
+    ]
+
+
+def _functions(tangent: Tangent) -> list[Group]:
+    """Give forces that are smooth functions of one variable, and declared terms that change in time."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    kinds: dict[str, Callable[[Path], ndarray]] = {
+        "a force that depends on u": _of_field,
+        "a coupling that depends on the stretch": _of_stretch,
+        "terms that change in time": _in_time,
+    }
+    if dynamics.order == 2:
+        kinds["a force that depends on v"] = _of_velocity
+    if dynamics.sites < 2 or too_wide(Term("u[n+1]+u[n-1]"), dynamics):
+        del kinds["a coupling that depends on the stretch"]
+    found: list[Group] = []
+    for name, make in kinds.items():
+        columns = tangent.columns(lambda _, path, make=make: path.answer(make(path)))  # type: ignore[misc]
+        length = np.linalg.norm(columns, axis=0)
+        # Equal visibility for each, but for what is too small to be seen.
+        kept = length > 1e-6 * np.max(length, initial=0.0)
+        found += _group(name, [attempt(tangent, Change(Effect("unnamed", "0")), columns[:, kept], random=True)])
+    return found
+
+
+def _polynomials(size: ndarray, factor: ndarray) -> ndarray:
+    """Give Chebyshev polynomials of a variable's size times a factor: (degrees, fine, N); higher ones are less likely."""
+    x = 2 * size / max(float(np.max(size)), 1e-300) - 1
+    values = np.polynomial.chebyshev.chebvander(x, DEGREES - 1)
+    return np.asarray(np.moveaxis(values / (1.0 + np.arange(DEGREES)), -1, 0) * factor)
+
+
+def _sources(path: Path, values: ndarray) -> ndarray:
+    """Bring forces (columns, fine, N) into the shape of sources; complex ones once more, turned by i."""
+    dynamics = path.record.stretches.dynamics
+    if dynamics.is_complex:
+        values = np.concatenate([values, 1j * values])
+        parts = np.stack([values.real, values.imag], axis=2)
+    else:
+        parts = values[:, :, None].real
+    return np.asarray(parts[..., dynamics.moving])
+
+
+def _of_field(path: Path) -> ndarray:
+    u = path.fields()[0]
+    if path.is_complex:
+        return _sources(path, _polynomials(np.abs(u), u))
+    return _sources(path, _polynomials(u - np.min(u), np.ones_like(u)))
+
+
+def _of_velocity(path: Path) -> ndarray:
+    v = path.fields()[1]
+    assert v is not None
+    return _sources(path, _polynomials(v - np.min(v), np.ones_like(v)))
+
+
+def _of_stretch(path: Path) -> ndarray:
+    """Give functions of each spring's stretch, odd as action and reaction are."""
+    dynamics = path.record.stretches.dynamics
+    first, second = path.sources([Term("u[n+1]-u[n]"), Term("u[n-1]-u[n]")])
+    stretches = np.stack([first, second])
+    size = np.linalg.norm(stretches, axis=2, keepdims=True)
+    x = 2 * size / max(float(np.max(size)), 1e-300) - 1
+    values = np.polynomial.chebyshev.chebvander(x, DEGREES - 1) / (1.0 + np.arange(DEGREES))
+    pulls = np.moveaxis(np.sum(values * stretches[..., None], axis=0), -1, 0)
+    if dynamics.is_complex:
+        pulls = np.concatenate([pulls, np.stack([-pulls[:, :, 1], pulls[:, :, 0]], axis=2)])
+    return np.asarray(pulls)
+
+
+def _in_time(path: Path) -> ndarray:
+    """Give each term of the model, and the field itself, times half waves in time."""
+    dynamics = path.record.stretches.dynamics
+    plain = [
+        (term, weights) for term, weights in zip(dynamics.terms, _weights(path), strict=True) if "t" not in term.names
+    ]
+    even = np.ones(dynamics.count)
+    plain += [(Term(f"{part}u[n]"), even) for part in _parts(path)]
+    each = path.sources([term for term, _ in plain]) * np.stack([weights for _, weights in plain])[:, None, None]
+    x = (path.times - path.times[0]) / (path.times[-1] - path.times[0])
+    return np.concatenate([each * np.cos(np.pi * k * x)[:, None, None] / k for k in range(1, HALF_WAVES + 1)])
+
+
+def _weights(path: Path) -> ndarray:
+    dynamics = path.record.stretches.dynamics
+    weights = np.ones((len(dynamics.terms), dynamics.sites)) if dynamics.weights is None else dynamics.weights
+    return np.asarray(weights[:, dynamics.moving])
+
+
+def _nets(tangent: Tangent) -> list[Group]:
+    """Give smooth forces in space and time, and patterns of the residual itself."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    change = Change(Effect("unnamed", "0"))
+    sites = dynamics.sites
+    place = (np.arange(sites) + 0.5) / sites
+    modes = [np.cos(np.pi * k * place) for k in range(min(MODES, sites))]
+
+    def smooth(_number: int, path: Path, low: int, high: int) -> ndarray:
+        x = (path.times - path.times[0]) / (path.times[-1] - path.times[0])
+        sources = []
+        for k in range(low, high):
+            for mode in modes:
+                for part in range(dynamics.parts):
+                    source = np.zeros((len(x), dynamics.parts, sites))
+                    source[:, part] = np.cos(np.pi * k * x)[:, None] * mode
+                    sources.append(source[..., dynamics.moving])
+        return path.answer(np.stack(sources))
+
+    def pattern(_number: int, path: Path, level: int, low: int, high: int) -> ndarray:
+        rows = len(path.record.times)
+        x = (np.arange(rows) + 0.5) / rows
+        columns = []
+        for k in range(low, high):
+            for mode in modes:
+                for part in range(dynamics.parts):
+                    wrong = np.zeros(path.weight.shape)
+                    wrong[:, level, part] = np.cos(np.pi * k * x)[:, None] * mode
+                    columns.append(wrong)
+        return path.rows(np.stack(columns))
+
+    groups: list[Group] = []
+    for low, high in ((0, 3), (3, 9), (9, 18)):
+        columns = tangent.columns(lambda k, path, a=low, b=high: smooth(k, path, a, b))  # type: ignore[misc]
+        name = f"a smooth force, {low}-{high - 1} half waves in time"
+        groups += _group(name, [attempt(tangent, change, columns, random=True)])
+    for level in range(tangent.paths[0].weight.shape[1]):
+        for low, high in ((0, 4), (4, 12)):
+            columns = tangent.columns(lambda k, path, c=level, a=low, b=high: pattern(k, path, c, a, b))  # type: ignore[misc]
+            name = f"a pattern in {'uv'[level]}, {low}-{high - 1} half waves in time"
+            groups += _group(name, [attempt(tangent, change, columns)])
+    return groups
+
+
+def _group(name: str, tries: Sequence[Try | None]) -> list[Group]:
+    """Give a group of what can be tried, if there is any."""
+    found = [one for one in tries if one is not None]
+    return [(name, found)] if found else []

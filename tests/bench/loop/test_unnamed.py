@@ -1,0 +1,113 @@
+"""What has no name: smooth functions hold what they should, and win where no name is right."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import systems
+from bench.loop import unnamed
+from bench.loop.model import Model, first_fit
+from bench.loop.repair import diagnose
+from bench.loop.specimen import OTHERS, make
+from bench.loop.tangent import linearise
+from bench.loop.trace import screen
+from systems.effects import CATALOGUE
+from systems.lattice import library
+
+# What is left of a force of z = 40 is then as large as one standard error.
+FAITHFUL = 0.03
+SMALL = {"sites": 9, "samples": 30, "span": 6.0}
+
+
+@functools.cache
+def tangent_of(name, effect="none", z=0.0):
+    system = systems.find(name)
+    one = make(system, effect, z, np.random.default_rng(4), **SMALL, variation=True)
+    data = [replace(one.samples.observed(), ends=system.ends)]
+    return linearise(first_fit(Model(system.library("equation"), system.order), data))
+
+
+def left_by(columns, target):
+    """The share of a force that a sum of others leaves, by least squares."""
+    matrix = columns.reshape(len(columns), -1).T
+    found = np.linalg.lstsq(matrix, target.ravel(), rcond=None)[0]
+    return np.linalg.norm(matrix @ found - target.ravel()) / np.linalg.norm(target)
+
+
+@pytest.mark.parametrize("force", [lambda u: np.cos(2 * u + 1), lambda u: u / (1 + u**2), np.tanh, lambda u: u**5])
+def test_a_smooth_force_that_depends_on_the_field_is_a_sum_of_the_polynomials(force):
+    path = tangent_of("sine-gordon").paths[0]
+    u, v = path.fields()
+    for make_them, x in ((unnamed._of_field, u), (unnamed._of_velocity, v)):
+        assert left_by(make_them(path), force(x)[:, None]) < FAITHFUL
+
+
+def test_a_complex_force_that_depends_on_the_size_of_the_field_is_one_too():
+    path = tangent_of("dnls").paths[0]
+    u = path.fields()[0]
+    force = (0.3 - 1j) * u / (1 + np.abs(u) ** 2)
+    assert left_by(unnamed._of_field(path), np.stack([force.real, force.imag], axis=1)) < FAITHFUL
+
+
+@pytest.mark.parametrize("name", ["phi4", "ginzburg-landau"])
+def test_what_a_spring_does_to_one_end_it_does_to_the_other_the_other_way_round(name):
+    pulls = unnamed._of_stretch(tangent_of(name).paths[0])
+    np.testing.assert_allclose(np.sum(pulls, axis=-1), 0, atol=1e-10 * np.max(np.abs(pulls)))
+
+
+def test_springs_of_any_law_are_sums_of_the_polynomials():
+    path = tangent_of("phi4").paths[0]
+    u = path.fields()[0]
+    right = np.concatenate([u[:, 1:], u[:, -1:]], axis=1) - u
+    left = np.concatenate([u[:, :1], u[:, :-1]], axis=1) - u
+    assert left_by(unnamed._of_stretch(path), (np.tanh(2 * right) + np.tanh(2 * left))[:, None]) < FAITHFUL
+
+
+def test_a_stiffness_that_changes_in_time_is_a_sum_of_half_waves():
+    path = tangent_of("sine-gordon").paths[0]
+    u = path.fields()[0]
+    x = (path.times - path.times[0]) / (path.times[-1] - path.times[0])
+    assert left_by(unnamed._in_time(path), ((x - 0.5)[:, None] * u)[:, None]) < FAITHFUL
+
+
+@pytest.mark.parametrize(
+    ("effect", "name"),
+    [("other: wavy-drag", "a force that depends on v"), ("other: uneven-bonds", "uneven bonds")],
+)
+def test_what_has_no_form_is_found_by_what_it_depends_on(effect, name):
+    found = screen(tangent_of("sine-gordon", effect, 40.0), CATALOGUE, np.random.default_rng(0), 40)
+    smooth = [one.name for one in found if not one.named and one.random]
+    assert smooth[0] == name
+
+
+@pytest.mark.parametrize(
+    ("name", "effect"), [("sine-gordon", "other: cubic-drag"), ("dnls", "other: drifting-stiffness")]
+)
+def test_a_name_that_comes_near_is_not_given_where_a_term_without_one_does_better(name, effect):
+    assert effect in OTHERS
+    system = systems.find(name)
+    one = make(system, effect, 40.0, np.random.default_rng(1), sites=15, samples=40, span=8.0, variation=True)
+    found = diagnose(
+        system.library("equation"), system.order, [replace(one.samples.observed(), ends=system.ends)], CATALOGUE
+    )
+    assert one.apart > 5
+    assert found.course.verdict in ("unexplained", "partly explained")
+
+
+def test_a_drive_has_at_least_one_wave_in_the_record():
+    """A slow drift is no oscillation, however well a piece of a long wave fits it."""
+    system = systems.find("phi4")
+    one = make(system, "other: drifting-stiffness", 30.0, np.random.default_rng(3), **SMALL, variation=True)
+    found = diagnose(
+        library("declared", [term.text for term in system.library("equation").terms]), 2,
+        [replace(one.samples.observed(), ends=system.ends)], CATALOGUE,
+    )  # fmt: skip
+    span = one.samples.t[-1] - one.samples.t[0]
+    for turn in found.course.rounds:
+        for entry in turn.ranking:
+            changes = entry.fitted.model.changes if entry.fitted is not None else ()
+            assert all(abs(change.psi.get("omega", np.inf)) > 0.999 * 2 * np.pi / span for change in changes)
