@@ -11,8 +11,8 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -255,7 +255,7 @@ def fit(
     """Fit the coefficients of a library to recorded samples."""
     import methods
     from bench.screen import show_fit, waiting
-    from methods.method import Skipped, make, solve
+    from methods.method import make, solve
     from systems.files import write_text
     from systems.samples import read_all
 
@@ -263,17 +263,12 @@ def fit(
     chosen = make(methods.find(method), _texts(given))
     _, candidates, order = _asked(system, library, terms, order)
     data = read_all(files, ends)
-    try:
-        with waiting(f"{method}: fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
-            found = solve(chosen, data, candidates, order, seed)
-    except Skipped as reason:
-        raise InputError(
-            f"method {method!r} cannot fit {data[0].source}: {reason}; choose another with --method"
-        ) from None
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{data[0].source}: method {method!r} failed: {type(error).__name__}: {error}") from error
+    with (
+        _told(data, method, f"method {method!r}"),
+        waiting(f"{method}: fitting {len(candidates.terms)} terms"),
+        redirect_stdout(sys.stderr),
+    ):
+        found = solve(chosen, data, candidates, order, seed)
     content = json.dumps(_fit_json(found), indent=2, allow_nan=False) + "\n"
     if json_out == "-":
         print(content, end="")
@@ -331,7 +326,7 @@ def diagnose(
     import methods
     from bench.loop.repair import diagnose as close_the_loop
     from bench.loop.report import content, show, watching
-    from methods.method import Skipped, make, solve
+    from methods.method import make, solve
     from systems.effects import CATALOGUE, load
     from systems.files import write_text
     from systems.samples import read_all
@@ -352,22 +347,11 @@ def diagnose(
         )
     # Read together, since the two must be of the same chain.
     later = read_all([*files, *holdout], ends)[len(data) :] if holdout else []
-    try:
-        with watching() as watcher, redirect_stdout(sys.stderr):
-            start = (
-                None
-                if method is None
-                else solve(make(methods.find(method), {}), data, declared, order, seed).coefficients
-            )
-            found = close_the_loop(declared, order, data, catalogue, seed, held_out=later, watcher=watcher, start=start)
-    except Skipped as reason:
-        raise InputError(
-            f"method {method!r} cannot fit {data[0].source}: {reason}; choose another with --method"
-        ) from None
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{data[0].source}: the diagnosis failed: {type(error).__name__}: {error}") from error
+    with _told(data, method, "the diagnosis"), watching() as watcher, redirect_stdout(sys.stderr):
+        start = (
+            None if method is None else solve(make(methods.find(method), {}), data, declared, order, seed).coefficients
+        )
+        found = close_the_loop(declared, order, data, catalogue, seed, held_out=later, watcher=watcher, start=start)
     text = json.dumps(content(found), indent=2, allow_nan=False) + "\n"
     # Files first: whoever reads the screen may stop reading.
     if html_out is not None:
@@ -780,17 +764,34 @@ def limit(
 def _followed(data: Sequence[Samples], candidates: Library, order: int) -> Fit:
     """Fit by the method that gives the motion it follows."""
     import methods
-    from methods.method import Skipped, solve
+    from methods.method import solve
 
     method = next(kind() for kind in methods.registered().values() if kind().abilities.motion)
-    try:
+    with _told(data, None, "the fit"):
         return solve(method, data, candidates, order, 1)
+
+
+@contextmanager
+def _told(data: Sequence[Samples], method: str | None, what: str) -> Iterator[None]:
+    """Say in one line why nothing came of a fit.
+
+    Raises:
+        InputError: it was skipped, or it failed.
+    """
+    from methods.method import Skipped
+
+    try:
+        yield
     except Skipped as reason:
-        raise InputError(f"{data[0].source}: {reason}") from None
+        if method is None:
+            raise InputError(f"{data[0].source}: {reason}") from None
+        raise InputError(
+            f"method {method!r} cannot fit {data[0].source}: {reason}; choose another with --method"
+        ) from None
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"{data[0].source}: the fit failed: {type(error).__name__}: {error}") from error
+        raise InputError(f"{data[0].source}: {what} failed: {type(error).__name__}: {error}") from error
 
 
 def _limit_json(found: Limit, needed: Design, note: str) -> dict[str, Any]:

@@ -69,6 +69,7 @@ def test_more_data_never_hurt():
     assert np.all(bound(system, one, variations=[None, np.random.default_rng(0)]).stderr < usual.stderr)
 
 
+@pytest.mark.slow
 def test_thirty_one_sites_take_less_than_a_second():
     system = systems.find("phi4")
     one = system.library("lib2")
