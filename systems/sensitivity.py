@@ -689,13 +689,68 @@ def condense(
         wide[:, size : size + splines] = edge[:, :-1]
         wide[:, -1] = edge[:, -1]
         sums.add_rows(wide)
+    local = _local_columns(stretches, transition) if splines else None
+    if isinstance(sums, _Triangle):
+        _gather(sums, transition, weights, residuals, defects, splines, local)
+    else:
+        _square(sums, transition, weights, residuals, defects, splines, local)
+    rows, target, solve = sums.reduce(terms)
+
+    def own(change: ndarray) -> tuple[ndarray, ndarray]:
+        found = solve(change)
+        return found[:size], found[size:]
+
+    return Condensed(rows, target, own, transition, defects, stretches)
+
+
+def _gather(
+    sums: _Triangle,
+    transition: Transition,
+    weights: ndarray,
+    residuals: ndarray,
+    defects: ndarray,
+    splines: int,
+    local: ndarray | None,
+) -> None:
+    """Follow what the start, the drive, the coefficients and (last row) the defects do, and collect many times at once."""
+    count, size = defects.shape
+    z = np.zeros((sums.columns + 1, size))
+    z[:size] = np.eye(size)
+    block = max(1, CHUNK // z.size)
+    kept = np.empty((min(block, count + 1), *z.shape))
+    for k in range(count + 1):
+        number = k % block
+        kept[number] = z
+        if number == block - 1 or k == count:
+            now = slice(k - number, k + 1)
+            sums.add(kept[: number + 1], weights[now], residuals[now])
+        if k == count:
+            break
+        z = z @ transition.by_state[k]
+        z[size + splines : -1] += transition.by_coefficient[k]
+        z[-1] += defects[k]
+        if local is not None:
+            assert transition.by_drive is not None
+            z[size + local[k]] += transition.by_drive[k]
+
+
+def _square(
+    sums: _Squares,
+    transition: Transition,
+    weights: ndarray,
+    residuals: ndarray,
+    defects: ndarray,
+    splines: int,
+    local: ndarray | None,
+) -> None:
+    """Do the same for normal equations, one time after another."""
+    count, size = defects.shape
     state: Any = np.eye(size)
-    if sparse:
+    if sums.sparse:
         import scipy.sparse
 
         state = scipy.sparse.csr_array(scipy.sparse.identity(size, format="csr"))
-    other = np.zeros((splines + terms + 1, size))
-    local = _local_columns(stretches, transition) if splines else None
+    other = np.zeros((sums.columns + 1 - size, size))
     for k in range(count + 1):
         # The last row of `other` is what the defects alone would do.
         sums.add(state, other, weights[k], residuals[k])
@@ -709,16 +764,9 @@ def condense(
         if local is not None:
             assert transition.by_drive is not None
             other[local[k]] += transition.by_drive[k]
-        if sparse:
+        if sums.sparse:
             state.data[np.abs(state.data) < TAIL * 1e-3 * np.max(np.abs(state.data))] = 0.0
             state.eliminate_zeros()
-    rows, target, solve = sums.reduce(terms)
-
-    def own(change: ndarray) -> tuple[ndarray, ndarray]:
-        found = solve(change)
-        return found[:size], found[size:]
-
-    return Condensed(rows, target, own, transition, defects, stretches)
 
 
 def _edge_rows(stretches: Stretches, weights: ndarray | None, residuals: ndarray | None) -> ndarray | None:
@@ -765,15 +813,14 @@ class _Triangle:
             self.kept = [_triangular(np.concatenate(self.kept))]
             self.waiting = len(self.kept[0])
 
-    def add(self, state: ndarray, other: ndarray, weights: ndarray, residuals: ndarray) -> None:
-        seen = np.flatnonzero(weights > 0)
-        if len(seen) == 0:
-            return
-        rows = np.empty((len(seen), self.columns + 1))
-        rows[:, : len(state)] = state[:, seen].T
-        rows[:, len(state) : -1] = other[:-1, seen].T
-        rows[:, -1] = residuals[seen] - other[-1, seen]
-        self.add_rows(rows * weights[seen, None])
+    def add(self, z: ndarray, weights: ndarray, residuals: ndarray) -> None:
+        """Add the readings at B times: z (B, columns + 1, S), weights and residuals (B, S)."""
+        rows = np.moveaxis(z, 1, 2).copy()
+        rows[..., -1] = residuals - rows[..., -1]
+        rows *= weights[..., None]
+        seen = weights > 0
+        if np.any(seen):
+            self.add_rows(rows[seen])
 
     def reduce(self, terms: int) -> tuple[ndarray, ndarray, Callable[[ndarray], ndarray]]:
         from scipy.linalg import solve_triangular
@@ -798,7 +845,7 @@ class _Squares:
     """The same problem as normal equations; the states' block is sparse for long chains."""
 
     def __init__(self, size: int, columns: int, sparse: bool) -> None:
-        self.size, self.sparse = size, sparse
+        self.size, self.columns, self.sparse = size, columns, sparse
         self.block: Any = np.zeros((size, size))
         if sparse:
             import scipy.sparse
