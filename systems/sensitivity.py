@@ -353,10 +353,10 @@ class Stretches:
     held: bool = False
 
     def joins(self, other: Stretches) -> bool:
-        """Say whether both follow the same equation and nothing acts from outside, so that they can be integrated as one."""
+        """Say whether both follow the same equation, without inputs or a drive of their own, so that they can be integrated as one."""
         one, two = self.dynamics, other.dynamics
-        outside = (self.inputs, self.drive, one.factors, other.inputs, other.drive, two.factors)
-        same = ("terms", "order", "is_complex", "sites", "ends", "least_reach")
+        outside = (self.inputs, self.drive, other.inputs, other.drive)
+        same = ("terms", "order", "is_complex", "sites", "ends", "least_reach", "factors")
         return (
             all(given is None for given in outside)
             and all(getattr(one, name) == getattr(two, name) for name in same)

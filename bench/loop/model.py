@@ -275,9 +275,15 @@ class Model:
         """Set the equation up on each trajectory."""
         found = []
         ends = next((change.ends for change in self.changes if change.ends), None)
+        # Pieces of one record share their forces, so that they can be integrated as one.
+        shared: dict[tuple[object, ...], list[Force]] = {}
         for number, samples in enumerate(data):
             seen = samples if ends is None else replace(samples, ends=ends)
-            forces = self.forces(samples.sites, samples.is_complex, number)
+            pasts = [change.past[min(number, len(change.past) - 1)] for change in self.changes if change.past]
+            kind = (samples.sites, samples.is_complex, *map(id, pasts))
+            if kind not in shared:
+                shared[kind] = self.forces(samples.sites, samples.is_complex, number)
+            forces = shared[kind]
             weights = np.stack([np.ones(samples.sites) if one.weights is None else one.weights for one in forces])
             for change in self.changes:
                 scale = change.scales(samples.sites)
