@@ -23,7 +23,7 @@ from __future__ import annotations
 import functools
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -35,7 +35,7 @@ from methods.weak import LOADS, Weak
 from systems.errors import InputError
 from systems.lattice import Library
 from systems.samples import Samples
-from systems.sensitivity import Condensed, Drive, Dynamics, Factor, Stretches, condense, split_parts
+from systems.sensitivity import Condensed, Drive, Dynamics, Factor, Stretches, Transition, condense, split_parts
 from systems.terms import Term
 
 if TYPE_CHECKING:
@@ -339,11 +339,72 @@ def _evaluate(records: Sequence[Record], state: State, ends: Sequence[ndarray]) 
     return _Point(state, tuple(residuals), tuple(defects))
 
 
-def _ends(records: Sequence[Record], state: State, substeps: Sequence[ndarray]) -> list[ndarray]:
-    return [
-        record.stretches.run(state.coefficients, nodes[:-1], steps, splines)
-        for record, nodes, splines, steps in zip(records, state.nodes, state.splines, substeps, strict=True)
-    ]
+class _Side:
+    """Trajectories side by side: those of one equation with nothing acting from outside are integrated as one.
+
+    A long record in many pieces then costs no more calls than a whole one.
+    """
+
+    def __init__(self, records: Sequence[Record]) -> None:
+        self.groups: list[list[int]] = []
+        for number, record in enumerate(records):
+            group = next((g for g in self.groups if record.stretches.joins(records[g[0]].stretches)), None)
+            if group is None:
+                self.groups.append([number])
+            else:
+                group.append(number)
+        self.stretches = [self._joined([records[k].stretches for k in group]) for group in self.groups]
+        self.counts = [len(record.times) - 1 for record in records]
+
+    @staticmethod
+    def _joined(parts: Sequence[Stretches]) -> Stretches:
+        if len(parts) == 1:
+            return parts[0]
+        begin, end = (np.concatenate([getattr(part, name) for part in parts]) for name in ("begin", "end"))
+        return replace(parts[0], begin=begin, end=end)
+
+    def _each(self, work: Callable[[Stretches, list[int]], Any], cut: Callable[[Any, slice], Any]) -> list[Any]:
+        """Do the work for each group, and give each trajectory its part of what comes out."""
+        found: list[Any] = [None] * len(self.counts)
+        for group, stretches in zip(self.groups, self.stretches, strict=True):
+            whole, begin = work(stretches, group), 0
+            for number in group:
+                found[number] = cut(whole, slice(begin, begin + self.counts[number]))
+                begin += self.counts[number]
+        return found
+
+    def run(self, state: State, substeps: Sequence[ndarray]) -> list[ndarray]:
+        """Integrate all states; see `Stretches.run`."""
+        return self._each(
+            lambda stretches, group: stretches.run(state.coefficients, *_of_group(state, substeps, group)), _rows
+        )
+
+    def vary(self, state: State, substeps: Sequence[ndarray]) -> list[Transition]:
+        """Integrate all states with their derivatives; see `Stretches.vary`."""
+        return self._each(
+            lambda stretches, group: stretches.vary(state.coefficients, *_of_group(state, substeps, group)),
+            lambda whole, rows: Transition(
+                whole.end[rows], whole.by_state[rows], whole.by_coefficient[rows],
+                *(None if part is None else part[rows] for part in (whole.by_drive, whole.first)),
+            ),
+        )  # fmt: skip
+
+    def substeps(self, state: State, tolerance: Sequence[ndarray]) -> list[ndarray]:
+        """Find how many steps all stretches need; see `Stretches.substeps`."""
+        wide = [np.broadcast_to(one, (count, len(one))) for one, count in zip(tolerance, self.counts, strict=True)]
+        return self._each(
+            lambda stretches, group: stretches.substeps(state.coefficients, *_of_group(state, wide, group)), _rows
+        )
+
+
+def _rows(whole: ndarray, rows: slice) -> ndarray:
+    return whole[rows]
+
+
+def _of_group(state: State, others: Sequence[ndarray], group: Sequence[int]) -> tuple[ndarray, ndarray, ndarray | None]:
+    """Give the starts of all stretches of a group, something else of theirs, and the splines."""
+    starts = np.concatenate([state.nodes[k][:-1] for k in group])
+    return starts, np.concatenate([others[k] for k in group]), state.splines[group[0]]
 
 
 def maximise(
@@ -383,8 +444,9 @@ def maximise(
             return np.asarray(np.maximum(noise, floor))
         return np.asarray(np.maximum(np.sqrt(misfit / np.maximum(counts, 1) / spare), floor))
 
+    side = _Side(records)
     substeps = [np.ones(len(nodes) - 1, dtype=int) for nodes in state.nodes]
-    point = _evaluate(records, state, _ends(records, state, substeps))
+    point = _evaluate(records, state, side.run(state, substeps))
     sigma = np.maximum(estimate(point.misfit()), 1e-6 * height) if noise is None else estimate(point.misfit())
     reached = np.inf
     path = []
@@ -396,14 +458,8 @@ def maximise(
         wanted = max(wanted, 1e-10 * float(np.max(height)))
         if wanted < 0.5 * reached:
             reached = wanted
-            substeps = [
-                r.stretches.substeps(state.coefficients, nodes[:-1], tolerances(r, sigma, reached), splines)
-                for r, nodes, splines in zip(records, state.nodes, state.splines, strict=True)
-            ]
-        transitions = [
-            r.stretches.vary(state.coefficients, nodes[:-1], n, splines)
-            for r, nodes, splines, n in zip(records, state.nodes, state.splines, substeps, strict=True)
-        ]
+            substeps = side.substeps(state, [tolerances(record, sigma, reached) for record in records])
+        transitions = side.vary(state, substeps)
         if not all(np.all(np.isfinite(one.end)) for one in transitions):
             break
         point = _evaluate(records, state, [one.end for one in transitions])
@@ -434,7 +490,7 @@ def maximise(
         length, found = 1.0, None
         for _halving in range(MAX_HALVINGS):
             trial = _moved(state, change, moves, length)
-            candidate = _evaluate(records, trial, _ends(records, trial, substeps))
+            candidate = _evaluate(records, trial, side.run(trial, substeps))
             near = candidate.gap(sizes)
             if gap > closed_gap:
                 better = near <= max((1 - 0.1 * length) * gap, closed_gap)

@@ -7,7 +7,9 @@ end of a stretch of motion by its start and by the coefficients follow from
 
 (Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, section I.14). dF/dy comes from the term language, so that
 the derivatives are exact up to the integrator's error, which is that of the Runge-Kutta formulas of Dormand and Prince of order 8
-(the same book, section II.5), with steps of fixed length inside a stretch.
+(the same book, section II.5), with steps of fixed length inside a stretch. Dry friction, sign(v), jumps where a site turns round and
+holds a site that is at rest; it counts as its mean over one step (`Dynamics.linear`), so that it can be integrated and derived, and
+becomes the jump as the steps get shorter.
 
 All stretches between sample times are integrated side by side. Where a stretch is short, a site feels only its near neighbours in
 it; sites far apart are then disturbed together and told apart afterwards (Curtis, Powell & Reid, IMA J. Appl. Math. 13, 117 (1974)),
@@ -184,8 +186,14 @@ class Dynamics:
         driven: Float[ndarray, "batch order parts border"] | None = None,
         *,
         derivatives: bool = True,
+        step: Float[ndarray, " batch"] | None = None,
     ) -> tuple[ndarray, ndarray, dict[tuple[int, Slot], ndarray]]:
         """Evaluate the right-hand side and its derivatives.
+
+        With steps of length h the term sign(v[n]) is tanh(2 v / (h b)), b the larger of the acceleration by all other terms and
+        of the friction's own: about its mean over the step in which the site turns round, and where the site is at rest a
+        friction that stops it within a step and holds it against any smaller acceleration (as in Moreau's time stepping,
+        Nonsmooth Mechanics and Applications (1988)). Derivatives are taken with b held.
 
         Returns:
             dy/dt (B, S); the terms' values with their weights (parts, terms, B, M); and for each part and variable of the
@@ -203,11 +211,13 @@ class Dynamics:
         factors = self._factors(t)
         for term, factor in factors.items():
             values[:, term] *= factor
+        found: dict[tuple[int, Slot], ndarray] = {}
         rate = np.empty((len(t), self.order, self.parts, self.count))
         if self.order == 2:
             rate[:, 0] = y.reshape(rate.shape)[:, 1]
+        if step is not None and self._rubbing:
+            found = self._softened(coefficients, values, rate[:, 0, 0], step, factors, derivatives)
         rate[:, -1] = np.moveaxis(np.tensordot(coefficients, values, (0, 1)), 0, 1)
-        found: dict[tuple[int, Slot], ndarray] = {}
         if derivatives:
             slopes, places = self._partials
             outputs = slopes.function(*(windows(slot) for slot in slopes.slots)) if places else ()
@@ -219,6 +229,39 @@ class Dynamics:
                     share = share * factors[term][part]
                 found[part, slot] = found[part, slot] + share if (part, slot) in found else share
         return rate.reshape(y.shape), values, found
+
+    @functools.cached_property
+    def _rubbing(self) -> tuple[int, ...]:
+        """The terms of dry friction."""
+        if self.order == 1 or self.is_complex:
+            return ()
+        return tuple(k for k, term in enumerate(self.terms) if term.text.replace(" ", "") == "sign(v[n])")
+
+    def _softened(
+        self,
+        coefficients: ndarray,
+        values: ndarray,
+        v: ndarray,
+        step: ndarray,
+        factors: dict[int, ndarray],
+        derivatives: bool,
+    ) -> dict[tuple[int, Slot], ndarray]:
+        """Write dry friction as its mean over a step into `values`, and give its derivative."""
+        others = np.delete(np.arange(len(self.terms)), self._rubbing)
+        push = np.abs(np.tensordot(coefficients[others], values[0, others], (0, 0)))
+        total = np.zeros_like(v)
+        for term in self._rubbing:
+            size = np.ones_like(v) if self.weights is None else self.weights[term, self.moving] * np.ones_like(v)
+            if term in factors:
+                size = size * factors[term][0]
+            width = np.maximum(
+                step[:, None] / 2 * np.maximum(push, np.abs(coefficients[term] * size)), np.finfo(float).tiny
+            )
+            soft = np.tanh(v / width)
+            values[0, term] = size * soft
+            if derivatives:
+                total += coefficients[term] * size * (1 - soft**2) / width
+        return {(0, Slot("v", 0, "re")): total} if derivatives else {}
 
     def _factors(self, t: ndarray) -> dict[int, ndarray]:
         """Evaluate the factors at the sites that have an equation, each (parts, B, M)."""
@@ -309,6 +352,17 @@ class Stretches:
     drive: Drive | None = None
     held: bool = False
 
+    def joins(self, other: Stretches) -> bool:
+        """Say whether both follow the same equation, without inputs or a drive of their own, so that they can be integrated as one."""
+        one, two = self.dynamics, other.dynamics
+        outside = (self.inputs, self.drive, other.inputs, other.drive)
+        same = ("terms", "order", "is_complex", "sites", "ends", "least_reach", "factors")
+        return (
+            all(given is None for given in outside)
+            and all(getattr(one, name) == getattr(two, name) for name in same)
+            and np.array_equal(1.0 if one.weights is None else one.weights, 1.0 if two.weights is None else two.weights)
+        )
+
     @functools.cached_property
     def _active(self) -> tuple[ndarray, int]:
         """The first B-spline of each stretch, and how many live in a stretch at most."""
@@ -348,10 +402,11 @@ class Stretches:
         self,
         coefficients: Float[ndarray, " terms"],
         start: Float[ndarray, "stretch state"],
-        tolerance: float | Float[ndarray, " state"],
+        tolerance: float | Float[ndarray, " state"] | Float[ndarray, "stretch state"],
         splines: ndarray | None = None,
     ) -> Int[ndarray, " stretch"]:
         """Find how many steps each stretch needs, by halving until no number of a state moves by more than its tolerance."""
+        tolerance = np.broadcast_to(tolerance, start.shape)
         needed = np.ones(len(start), dtype=int)
         open_ = np.arange(len(start))
         coarse = self.run(coefficients, start, needed, splines)
@@ -361,7 +416,7 @@ class Stretches:
             with np.errstate(all="ignore"):
                 # Two solutions that are both unbounded do not get better by shorter steps.
                 lost = ~np.all(np.isfinite(fine), axis=1)
-                wrong = ~np.all(np.abs(fine - coarse) <= tolerance, axis=1) & ~lost
+                wrong = ~np.all(np.abs(fine - coarse) <= tolerance[open_], axis=1) & ~lost
             open_, coarse = open_[wrong], fine[wrong]
             needed[open_] *= 2
         return needed
@@ -463,7 +518,9 @@ class Stretches:
                         at_z = z + h[:, None, None] * _combine(a[stage, :stage], slopes_z)
                 f = None if self.inputs is None else self.inputs(t)
                 driven = self.driven(t, splines)
-                rate, values, slopes = self.dynamics.linear(coefficients, t, at_y, f, driven, derivatives=z is not None)
+                rate, values, slopes = self.dynamics.linear(
+                    coefficients, t, at_y, f, driven, derivatives=z is not None, step=h
+                )
                 slopes_y[stage] = rate
                 if slopes_z is not None:
                     self._vary_rate(slopes_z[stage], at_z, values, slopes, t, chosen)
@@ -632,13 +689,68 @@ def condense(
         wide[:, size : size + splines] = edge[:, :-1]
         wide[:, -1] = edge[:, -1]
         sums.add_rows(wide)
+    local = _local_columns(stretches, transition) if splines else None
+    if isinstance(sums, _Triangle):
+        _gather(sums, transition, weights, residuals, defects, splines, local)
+    else:
+        _square(sums, transition, weights, residuals, defects, splines, local)
+    rows, target, solve = sums.reduce(terms)
+
+    def own(change: ndarray) -> tuple[ndarray, ndarray]:
+        found = solve(change)
+        return found[:size], found[size:]
+
+    return Condensed(rows, target, own, transition, defects, stretches)
+
+
+def _gather(
+    sums: _Triangle,
+    transition: Transition,
+    weights: ndarray,
+    residuals: ndarray,
+    defects: ndarray,
+    splines: int,
+    local: ndarray | None,
+) -> None:
+    """Follow what the start, the drive, the coefficients and (last row) the defects do, and collect many times at once."""
+    count, size = defects.shape
+    z = np.zeros((sums.columns + 1, size))
+    z[:size] = np.eye(size)
+    block = max(1, CHUNK // z.size)
+    kept = np.empty((min(block, count + 1), *z.shape))
+    for k in range(count + 1):
+        number = k % block
+        kept[number] = z
+        if number == block - 1 or k == count:
+            now = slice(k - number, k + 1)
+            sums.add(kept[: number + 1], weights[now], residuals[now])
+        if k == count:
+            break
+        z = z @ transition.by_state[k]
+        z[size + splines : -1] += transition.by_coefficient[k]
+        z[-1] += defects[k]
+        if local is not None:
+            assert transition.by_drive is not None
+            z[size + local[k]] += transition.by_drive[k]
+
+
+def _square(
+    sums: _Squares,
+    transition: Transition,
+    weights: ndarray,
+    residuals: ndarray,
+    defects: ndarray,
+    splines: int,
+    local: ndarray | None,
+) -> None:
+    """Do the same for normal equations, one time after another."""
+    count, size = defects.shape
     state: Any = np.eye(size)
-    if sparse:
+    if sums.sparse:
         import scipy.sparse
 
         state = scipy.sparse.csr_array(scipy.sparse.identity(size, format="csr"))
-    other = np.zeros((splines + terms + 1, size))
-    local = _local_columns(stretches, transition) if splines else None
+    other = np.zeros((sums.columns + 1 - size, size))
     for k in range(count + 1):
         # The last row of `other` is what the defects alone would do.
         sums.add(state, other, weights[k], residuals[k])
@@ -652,16 +764,9 @@ def condense(
         if local is not None:
             assert transition.by_drive is not None
             other[local[k]] += transition.by_drive[k]
-        if sparse:
+        if sums.sparse:
             state.data[np.abs(state.data) < TAIL * 1e-3 * np.max(np.abs(state.data))] = 0.0
             state.eliminate_zeros()
-    rows, target, solve = sums.reduce(terms)
-
-    def own(change: ndarray) -> tuple[ndarray, ndarray]:
-        found = solve(change)
-        return found[:size], found[size:]
-
-    return Condensed(rows, target, own, transition, defects, stretches)
 
 
 def _edge_rows(stretches: Stretches, weights: ndarray | None, residuals: ndarray | None) -> ndarray | None:
@@ -708,15 +813,14 @@ class _Triangle:
             self.kept = [_triangular(np.concatenate(self.kept))]
             self.waiting = len(self.kept[0])
 
-    def add(self, state: ndarray, other: ndarray, weights: ndarray, residuals: ndarray) -> None:
-        seen = np.flatnonzero(weights > 0)
-        if len(seen) == 0:
-            return
-        rows = np.empty((len(seen), self.columns + 1))
-        rows[:, : len(state)] = state[:, seen].T
-        rows[:, len(state) : -1] = other[:-1, seen].T
-        rows[:, -1] = residuals[seen] - other[-1, seen]
-        self.add_rows(rows * weights[seen, None])
+    def add(self, z: ndarray, weights: ndarray, residuals: ndarray) -> None:
+        """Add the readings at B times: z (B, columns + 1, S), weights and residuals (B, S)."""
+        rows = np.moveaxis(z, 1, 2).copy()
+        rows[..., -1] = residuals - rows[..., -1]
+        rows *= weights[..., None]
+        seen = weights > 0
+        if np.any(seen):
+            self.add_rows(rows[seen])
 
     def reduce(self, terms: int) -> tuple[ndarray, ndarray, Callable[[ndarray], ndarray]]:
         from scipy.linalg import solve_triangular
@@ -741,7 +845,7 @@ class _Squares:
     """The same problem as normal equations; the states' block is sparse for long chains."""
 
     def __init__(self, size: int, columns: int, sparse: bool) -> None:
-        self.size, self.sparse = size, sparse
+        self.size, self.columns, self.sparse = size, columns, sparse
         self.block: Any = np.zeros((size, size))
         if sparse:
             import scipy.sparse

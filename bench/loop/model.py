@@ -10,6 +10,7 @@ of the fitted model (`bench.loop.tangent`), each followed by a fit of the rest.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -34,6 +35,12 @@ MIN_SITES = 9
 ACCURACY = 0.1
 # Parameters that are found by the search and then kept.
 KEPT = ("s", "open", "reach", "step", "inner", "origin")
+
+
+@functools.lru_cache(maxsize=512)
+def read_term(text: str) -> Term:
+    """Give a term that may be asked for many thousand times, read once."""
+    return Term(text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +95,7 @@ class Change:
         """Give the terms that it adds to the right-hand side, on the chain of one record."""
         acts, psi = self.effect.acts, self.psi
         if self.as_force:
-            return [Force(Term("1"), row, None, f"1 at site {k + 1}") for k, row in enumerate(np.eye(sites))]
+            return [Force(read_term("1"), row, None, f"1 at site {k + 1}") for k, row in enumerate(np.eye(sites))]
         if acts in INSTRUMENT or acts in ("one equation", "ends"):
             return []
         if acts == "harmonic":
@@ -98,7 +105,7 @@ class Change:
                 ("sin", lambda t: np.sin(omega * t)[None, :, None]),
             )
             return [
-                Force(Term(text), None, wave, f"{name}({omega:.6g}*t)" + ("" if text == "1" else f"*{text}"))
+                Force(read_term(text), None, wave, f"{name}({omega:.6g}*t)" + ("" if text == "1" else f"*{text}"))
                 for text in self.texts
                 for name, wave in waves
             ]
@@ -109,29 +116,31 @@ class Change:
                 return np.asarray(np.exp(-(((t - at) / width) ** 2) / 2)[None, :, None])
 
             shape = f"exp(-((t-{at:.6g})/{width:.6g})**2/2)"
-            return [Force(Term(text), None, pulse, shape + ("" if text == "1" else f"*{text}")) for text in self.texts]
+            return [
+                Force(read_term(text), None, pulse, shape + ("" if text == "1" else f"*{text}")) for text in self.texts
+            ]
         if acts == "delayed":
             return _delayed(self.past[min(record, len(self.past) - 1)], psi["delay"], is_complex)[: len(self.texts)]
         if acts == "long range":
             text = _far_text(psi, sites)
             label = f"sum over r>=2 of (u[n+r]+u[n-r]-2*u[n])/r**{psi['s']:.4g}"
-            whole = [Force(Term(text), label=label), Force(Term(f"i*({text})"), label=f"i*{label}")]
+            whole = [Force(read_term(text), label=label), Force(read_term(f"i*({text})"), label=f"i*{label}")]
             return whole[: len(self.texts)]
         if acts == "alternating":
             sign = np.where(np.arange(sites) % 2 == 0, 1.0, -1.0)
-            return [Force(Term(text), sign, None, f"(-1)**k*{text}") for text in self.texts]
+            return [Force(read_term(text), sign, None, f"(-1)**k*{text}") for text in self.texts]
         if acts == "one site":
             assert self.site is not None
-            return [Force(Term(text), np.eye(sites)[self.site], None, text) for text in self.texts]
+            return [Force(read_term(text), np.eye(sites)[self.site], None, text) for text in self.texts]
         if acts == "every site":
             # Deviations from their mean, which is the last site's too.
             each = np.eye(sites)[:-1] - np.eye(sites)[-1]
             return [
-                Force(Term(text), row, None, f"{text} at site {k + 1}")
+                Force(read_term(text), row, None, f"{text} at site {k + 1}")
                 for text in self.texts
                 for k, row in enumerate(each)
             ]
-        return [Force(Term(text), label=text) for text in self.texts]
+        return [Force(read_term(text), label=text) for text in self.texts]
 
     def scales(self, sites: int) -> ndarray | None:
         """Give the factor of each site's whole right-hand side, or None where it has none."""
@@ -222,7 +231,7 @@ def _delayed(past: Factor, delay: float, is_complex: bool) -> list[Force]:
     """Give the field as it was, and i times it: known functions of time."""
     label = f"u[n] at t-{delay:.6g}"
     if not is_complex:
-        return [Force(Term("1"), None, lambda t: past(t - delay)[None], label)]
+        return [Force(read_term("1"), None, lambda t: past(t - delay)[None], label)]
 
     def now(t: ndarray) -> ndarray:
         field = past(t - delay)
@@ -232,7 +241,7 @@ def _delayed(past: Factor, delay: float, is_complex: bool) -> list[Force]:
         field = past(t - delay)
         return np.stack([-field.imag, field.real])
 
-    return [Force(Term("1+i"), None, now, label), Force(Term("1+i"), None, turned, f"i*({label})")]
+    return [Force(read_term("1+i"), None, now, label), Force(read_term("1+i"), None, turned, f"i*({label})")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,9 +275,15 @@ class Model:
         """Set the equation up on each trajectory."""
         found = []
         ends = next((change.ends for change in self.changes if change.ends), None)
+        # Pieces of one record share their forces, so that they can be integrated as one.
+        shared: dict[tuple[object, ...], list[Force]] = {}
         for number, samples in enumerate(data):
             seen = samples if ends is None else replace(samples, ends=ends)
-            forces = self.forces(samples.sites, samples.is_complex, number)
+            pasts = [change.past[min(number, len(change.past) - 1)] for change in self.changes if change.past]
+            kind = (samples.sites, samples.is_complex, *map(id, pasts))
+            if kind not in shared:
+                shared[kind] = self.forces(samples.sites, samples.is_complex, number)
+            forces = shared[kind]
             weights = np.stack([np.ones(samples.sites) if one.weights is None else one.weights for one in forces])
             for change in self.changes:
                 scale = change.scales(samples.sites)

@@ -41,12 +41,12 @@ MOST_EFFECTS = 4
 POLISH = 8
 # A residual of more than so many times the noise is gross: the model is then followed over shorter pieces.
 GROSS = 3.0
-MOST_PIECES = 100
+MOST_PIECES = 64
 # Readings beyond twice the number of unknowns that a test of what is left needs.
 SPARE = 10
 ARITHMETIC = 1e-6
 LONGEST = 4000
-MOST_SAMPLES = 40_000
+MOST_SAMPLES = 16_000
 # Thinning leaves at least so many samples.
 ENOUGH = 2000
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.loop.model import ACCURACY, Fitted, Force, rates
+from bench.loop.model import ACCURACY, Fitted, Force, rates, read_term
 from methods.trajectory import Record, tolerances
 from systems.lattice import Ends, evaluate
 from systems.sensitivity import Stretches, Transition
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 # Steps between two samples where one Runge-Kutta step was enough, and at most.
 FINE = 2
 FINEST = 8
+FRICTION = "sign(v[n])"
 # A column that keeps less than this of its length has nothing of its own to say.
 VISIBLE = 1e-5
 
@@ -83,6 +84,18 @@ class Path:
         inside = slice(reach[0], dynamics.sites - reach[1]) if ends == "unknown" else slice(0, dynamics.sites)
         sites[..., inside] = np.moveaxis(values, 0, 2)
         return sites[..., dynamics.moving]
+
+    def turning(self) -> Float[ndarray, "fine parts sites"]:
+        """Give the mean of sign(v) over what v may be: erf(v / (sqrt(2) s)), s the noise on v or, unseen, that on u over a step.
+
+        Where a site turns round or is at rest, nobody knows which way friction acts.
+        """
+        from scipy.special import erf
+
+        noise = [1 / float(np.max(self.weight[:, level], initial=1e-300)) for level in range(self.weight.shape[1])]
+        spread = noise[1] if len(noise) > 1 else noise[0] / float(np.mean(np.diff(self.record.times)))
+        v = self.field[:, 1][..., self.record.stretches.dynamics.moving]
+        return np.asarray(erf(v / (np.sqrt(2) * spread)))
 
     def answer(self, source: Float[ndarray, "columns fine parts sites"]) -> Float[ndarray, "rows columns"]:
         """Give what forces do to the readings, in units of the noise, one column each."""
@@ -242,7 +255,9 @@ def force_along(path: Path, forces: Sequence[Force], coefficients: ndarray | Non
     """Evaluate forces along a path: their sum (fine, parts, sites) with coefficients, or each (forces, fine, parts, sites)."""
     dynamics = path.record.stretches.dynamics
     texts = list(dict.fromkeys(force.term.text for force in forces))
-    values = dict(zip(texts, path.sources([Term(text) for text in texts]), strict=True))
+    values = dict(zip(texts, path.sources([read_term(text) for text in texts]), strict=True))
+    if FRICTION in values:
+        values[FRICTION] = path.turning()
     found = []
     for force in forces:
         value = values[force.term.text]

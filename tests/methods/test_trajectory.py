@@ -250,3 +250,25 @@ def test_with_the_coefficients_held_only_the_states_are_fitted_and_are_those_of_
     np.testing.assert_allclose(
         left(found.state.nodes[0][0]) ** 2 @ np.ones(record.value.size), 2 * best.cost, rtol=1e-3
     )
+
+
+def test_a_record_in_pieces_is_fitted_as_the_pieces_are_one_by_one():
+    phi4 = systems.find("phi4")
+    clean = simulate(phi4, sites=5, times=np.linspace(0, 12, 60))
+    data = observe(clean, np.random.default_rng(1), noise=0.01).observed()
+    terms = phi4.library("equation").terms
+    pieces = [
+        replace(data, ends="free", t=data.t[k : k + 20], u=data.u[k : k + 20], v=data.v[k : k + 20])
+        for k in (0, 20, 40)
+    ]
+    records = [prepare(one, terms, 2) for one in pieces]
+    state = guess(pieces, records)
+    # A factor of one in time keeps the second piece apart from the others.
+    dynamics = replace(
+        records[1].stretches.dynamics, factors=(*(None for _ in terms[1:]), lambda t: np.ones((1, len(t), 1)))
+    )
+    apart = [records[0], replace(records[1], stretches=replace(records[1].stretches, dynamics=dynamics)), records[2]]
+    one, other = (maximise(some, state, tolerance=0.02) for some in (records, apart))
+    np.testing.assert_allclose(one.state.coefficients, other.state.coefficients, rtol=1e-12)
+    for left, right in zip(one.state.nodes, other.state.nodes, strict=True):
+        np.testing.assert_allclose(left, right, rtol=1e-9, atol=1e-12)

@@ -190,3 +190,65 @@ def test_at_fixed_ends_a_wider_least_reach_changes_nothing():
     assert np.array_equal(
         plain, Dynamics(terms, 2, False, SITES, "fixed", least_reach=(2, 2)).linear(COEFFICIENTS[:1], t, y)[0]
     )
+
+
+# Dry friction -----------------------------------------------------------------------------------------------------------------
+
+
+def sliding(u, time, stiffness=64.0, friction=0.15):
+    """Where an oscillator with dry friction that is let go at u is after a time, half swing by half swing, and how fast."""
+    omega = np.sqrt(stiffness)
+    rest = friction / stiffness
+    while time > np.pi / omega and abs(u) > rest:
+        u = -(u - 2 * rest * np.sign(u))
+        time -= np.pi / omega
+    if abs(u) <= rest:
+        return np.array([u, 0.0])
+    middle = rest * np.sign(u)
+    return np.array([middle + (u - middle) * np.cos(omega * time), -(u - middle) * omega * np.sin(omega * time)])
+
+
+def followed(start, time, step, substeps=1):
+    dynamics = Dynamics((Term("u[n]"), Term("sign(v[n])")), 2, False, 1, "free")
+    y = np.array([start])
+    for begin in np.arange(round(time / step)) * step:
+        stretch = Stretches(dynamics, np.array([begin]), np.array([begin + step]))
+        y = stretch.run(np.array([-64.0, -0.15]), y, np.array([substeps]))
+    return y[0]
+
+
+def test_an_oscillator_with_dry_friction_turns_round_where_the_exact_motion_does():
+    for time in (0.3, 1.0, 2.0):
+        left = followed([0.06, 0.0], time, 0.004) - sliding(0.06, time)
+        np.testing.assert_allclose(left / [1, 8], 0, atol=1e-4)
+
+
+def test_it_comes_to_rest_and_hardly_creeps():
+    assert sliding(0.01, 3.0)[1] == 0
+    np.testing.assert_allclose(followed([0.01, 0.0], 3.0, 0.004, 4), sliding(0.01, 3.0), atol=1e-4)
+
+
+def test_shorter_steps_bring_dry_friction_nearer_to_the_jump():
+    wrong = [
+        np.linalg.norm((followed([0.06, 0.0], 1.92, 0.016, substeps) - sliding(0.06, 1.92)) / [1, 8])
+        for substeps in (1, 4, 16)
+    ]
+    assert wrong[2] < wrong[1] / 2 < wrong[0] / 4
+
+
+def test_a_site_at_rest_forgets_how_fast_it_came_and_keeps_where_it_is():
+    dynamics = Dynamics((Term("u[n]"), Term("sign(v[n])")), 2, False, 1, "free")
+    stretch = Stretches(dynamics, np.array([0.0]), np.array([0.02]))
+    by_state = stretch.vary(np.array([-64.0, -0.15]), np.array([[0.001, 0.0]]), np.array([4])).by_state[0]
+    assert by_state[0, 0] == pytest.approx(1, abs=0.02)
+    assert np.max(np.abs(by_state[1])) < 0.02
+
+
+def test_stretches_of_one_equation_join_unless_something_acts_from_outside():
+    dynamics = [Dynamics((Term("u[n]"),), 2, False, 3, "free", weights) for weights in (None, np.ones((1, 3)), None)]
+    one, weighted, same = (Stretches(each, np.array([0.0]), np.array([1.0])) for each in dynamics)
+    driven = Stretches(dynamics[0], np.array([0.0]), np.array([1.0]), lambda t: np.ones((len(t), 3)))
+    assert one.joins(same)
+    assert not one.joins(weighted)
+    assert not one.joins(driven)
+    assert not driven.joins(driven)

@@ -136,6 +136,16 @@ def test_what_is_outside_the_catalogue_gets_no_wrong_name(name, effect):
     assert over_noise(course.after, sigma) > 1.1
 
 
+def test_dry_friction_is_named_and_fitted_to_the_end_though_its_sign_jumps():
+    specimen, course, _ = looped("sine-gordon", "dry-friction")
+    assert names(course)[:1] == ["dry-friction"]
+    assert course.after.solution.converged
+    found = course.after.solution.state.coefficients[2]
+    error = np.sqrt(np.diag(course.after.solution.covariance))[2]
+    assert found == pytest.approx(-np.real(specimen.amount), abs=4 * error)
+    assert course.verdict == "explained"
+
+
 # Two at once ------------------------------------------------------------------------------------------------------------------
 
 

@@ -9,12 +9,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BSpline
 
-from bench.loop.model import Change, Fitted, Model
-from bench.loop.tangent import by_psi, linearise, orthonormal
+from bench.loop.model import Change, Fitted, Force, Model
+from bench.loop.tangent import by_psi, force_along, linearise, orthonormal
 from methods.trajectory import Solution, State, guess
 from systems.effects import find
 from systems.lattice import library
 from systems.samples import Samples
+from systems.terms import Term
 
 SITES = 6
 TIMES = np.linspace(0, 4, 21)
@@ -358,3 +359,18 @@ def test_columns_that_are_the_same_to_rounding_count_once():
     assert basis.shape[1] == 2
     assert orthonormal(np.zeros((30, 2))).shape == (30, 0)
     assert orthonormal(np.zeros((30, 0))).shape == (30, 0)
+
+
+# Dry friction -----------------------------------------------------------------------------------------------------------------
+
+
+def test_where_the_noise_hides_which_way_a_site_moves_friction_counts_by_its_mean():
+    path = linearise(fitted("real", "free")).paths[0]
+    v = path.field[:, 1]
+    blurred = force_along(path, [Force(Term("sign(v[n])"))])[0]
+    draw = np.random.default_rng(1)
+    slowest = np.unravel_index(np.argmin(np.abs(v)), v.shape)
+    expected = np.mean(np.sign(v[slowest] + SIGMA * draw.normal(size=100_000)))
+    assert blurred[slowest] == pytest.approx(expected, abs=0.02)
+    fast = np.abs(v) > 5 * SIGMA
+    np.testing.assert_allclose(blurred[fast], np.sign(v)[fast], atol=1e-5)
