@@ -1,6 +1,7 @@
 """Say which method's residual gives the best diagnosis, and write residuals.md and residuals.csv.
 
     python results/loop/residuals.py
+    python results/loop/residuals.py --page    # scores and page again, from the trials in residuals.csv
 
 A specimen is a recording with one force that the declared equation lacks. Each method fits the declared equation; what it leaves, r, is
 regressed on what each effect of the catalogue would add. Forces s(n, t) along the method's own state become columns R s by a linear
@@ -24,6 +25,7 @@ tail of chi squared at the gain, less the cost of the search, and ranks the effe
 from __future__ import annotations
 
 import itertools
+import sys
 import time
 import zlib
 from collections.abc import Callable, Sequence
@@ -59,6 +61,7 @@ SEEDS = (1,)
 CANDIDATES = tuple(effect for effect in CATALOGUE if effect.acts not in INSTRUMENT)
 # So near the best one in evidence an effect counts as not told from it.
 EQUAL = 3.0
+TIE = 1e-6
 SURROGATES = 100
 NOISE = 0.01
 # The slowest method is given every third specimen.
@@ -233,8 +236,13 @@ def trials() -> pd.DataFrame:
             rows += [{**trial(name, system, effect, z, seed, samples), "size": one.z} for name in chosen]
             number += 1
             print(f"{number}: {system.name}, {effect}, z = {z:g}", flush=True)
-    table = pd.DataFrame(rows)
-    table["first"], table["two"] = table["rank"] == 1, table["rank"] <= 2
+    return pd.DataFrame(rows)
+
+
+def scored(table: pd.DataFrame) -> pd.DataFrame:
+    """Add the scores; effects that are the same beside the declared terms are first together."""
+    table["first"] = table["behind"] <= TIE
+    table["two"] = table["first"] | (table["rank"] <= 2)
     table["near"] = table["behind"] <= EQUAL
     table["share"] = table["gain"] / table["size"] ** 2
     return table
@@ -289,12 +297,18 @@ def common(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def split(table: pd.DataFrame, one: str, other: str) -> tuple[int, int, int, int, float]:
-    """Count the specimens given to both of two methods: both right, only one, only the other, neither; and the sign test's chance."""
+    """Count the specimens given to both of two methods: both right, only one, only the other, neither; and the sign test's chance.
+
+    Specimens of one effect on one lattice share what was drawn for them, so the test counts each such effect once, for the method that
+    is right on more of its specimens.
+    """
     wide = table.pivot_table(index=KEYS, columns="method", values="first", aggfunc="first")[[one, other]].dropna()
     mine, theirs = (wide[name].astype(bool) for name in (one, other))
-    more, less = int((mine & ~theirs).sum()), int((theirs & ~mine).sum())
-    chance = float(binomtest(more, more + less).pvalue) if more + less else 1.0
-    return int((mine & theirs).sum()), more, less, int((~mine & ~theirs).sum()), chance
+    more, less = mine & ~theirs, theirs & ~mine
+    lead = (more.astype(int) - less.astype(int)).groupby(level=["system", "effect"]).sum()
+    ahead, behind = int((lead > 0).sum()), int((lead < 0).sum())
+    chance = float(binomtest(ahead, ahead + behind).pvalue) if ahead + behind else 1.0
+    return int((mine & theirs).sum()), int(more.sum()), int(less.sum()), int((~mine & ~theirs).sum()), chance
 
 
 def pairs(table: pd.DataFrame) -> str:
@@ -309,7 +323,7 @@ def pairs(table: pd.DataFrame) -> str:
     return markdown(pd.DataFrame(rows))
 
 
-def page(table: pd.DataFrame, about: dict[str, object]) -> str:
+def page(table: pd.DataFrame, about: dict[str, str]) -> str:
     """Write the page."""
     shared = common(table)
     order = shared.groupby("method")["first"].mean().reindex(list(METHODS)).sort_values(ascending=False, kind="stable")
@@ -320,7 +334,7 @@ def page(table: pd.DataFrame, about: dict[str, object]) -> str:
     chance = split(table, best, second)[-1]
     share = table.groupby("method")["share"].median()
     seconds = table.groupby("method")["seconds"].median()
-    named = table[(table["best"] != table["effect"]) & (table["status"] == "ok")]
+    named = table[~table["first"] & (table["status"] == "ok")]
     taken = {name: one["best"].value_counts().head(3) for name, one in named.groupby("method")}
     wrong = "; ".join(
         f"`{name}` " + ", ".join(f"{effect} {count}" for effect, count in taken[name].items())
@@ -351,10 +365,11 @@ def page(table: pd.DataFrame, about: dict[str, object]) -> str:
         "(A^T A + W)^-1 A^T rho: the force that ridge regression finds in rho, the trajectory's residual in units of the noise, A being what "
         "forces do to the readings. It is smoothed, shrunk and correlated from site to site; taking that back needs A, and then it is the "
         "trajectory's test. This is algebra, not measured here.\n",
-        "## All specimens\n", scores(whole),
+        "## All specimens\n", scores(whole), "Effects that are the same beside the declared terms are first together. "
         "gain / z^2: median of twice the log likelihood ratio of the right effect over the size squared. seconds: median processor time, fit and trace.\n",
         f"## The specimens that `{SLOW}` was given too\n", scores(shared),
-        "## In pairs\n", "Specimens that both were given; p: the chance of so uneven a split between two that are equally good (sign test).\n",
+        "## In pairs\n", "Specimens that both were given; p: the chance of so uneven a split between two that are equally good (sign test, "
+        "each effect on a lattice counting once).\n",
         pairs(table),
         "## Lattices and sizes\n", "Right effect ranked first.\n", firsts(table, ["system", "z"]),
         "## Effects\n", "Right effect ranked first, all lattices and sizes.\n", firsts(table, ["effect"]),
@@ -363,16 +378,28 @@ def page(table: pd.DataFrame, about: dict[str, object]) -> str:
     return "\n".join(parts)
 
 
+def read() -> tuple[pd.DataFrame, dict[str, str]]:
+    """Read residuals.csv: the trials, and its head."""
+    path = HERE / "residuals.csv"
+    head = [line for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("# ")]
+    return pd.read_csv(path, comment="#"), dict(line.removeprefix("# ").split(": ", 1) for line in head)
+
+
 def main() -> None:
-    """Run the trials and write both files."""
-    made = origin()
-    began = time.perf_counter()
-    table = trials()
-    versions = "; ".join(f"{name} {version}" for name, version in made["versions"].items())
-    about = {
-        "command": "python results/loop/residuals.py", "commit": made["commit"], "date": made["date"], "machine": made["machine"],
-        "versions": versions, "seeds": ", ".join(map(str, SEEDS)), "minutes": f"{(time.perf_counter() - began) / 60:.0f}",
-    }  # fmt: skip
+    """Run the trials, or read them where only the page is asked for, and write both files."""
+    if "--page" in sys.argv[1:]:
+        table, about = read()
+        about["scored at"] = origin()["commit"]
+    else:
+        made = origin()
+        began = time.perf_counter()
+        table = trials()
+        about = {
+            "command": "python results/loop/residuals.py", "commit": made["commit"], "date": made["date"], "machine": made["machine"],
+            "versions": "; ".join(f"{name} {version}" for name, version in made["versions"].items()),
+            "seeds": ", ".join(map(str, SEEDS)), "minutes": f"{(time.perf_counter() - began) / 60:.0f}",
+        }  # fmt: skip
+    table = scored(table)
     head = "".join(f"# {name}: {value}\n" for name, value in about.items())
     write_text(HERE / "residuals.csv", head + table.to_csv(index=False, float_format="%.6g"))
     write_text(HERE / "residuals.md", page(table, about))
