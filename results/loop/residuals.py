@@ -364,7 +364,8 @@ def page(table: pd.DataFrame, about: dict[str, str]) -> str:
         "- What the curves leave can be written down. Curves held to the equation by a penalty W have, to first order, the residual "
         "(A^T A + W)^-1 A^T rho: the force that ridge regression finds in rho, the trajectory's residual in units of the noise, A being what "
         "forces do to the readings. It is smoothed, shrunk and correlated from site to site; taking that back needs A, and then it is the "
-        "trajectory's test. This is algebra, not measured here.\n",
+        "trajectory's test. This is algebra, not measured here. W is what each method's cross-validation takes, which has the coefficients "
+        "in mind and not the residual; other W were not tried here.\n",
         "## All specimens\n", scores(whole), "Effects that are the same beside the declared terms are first together. "
         "gain / z^2: median of twice the log likelihood ratio of the right effect over the size squared. seconds: median processor time, fit and trace.\n",
         f"## The specimens that `{SLOW}` was given too\n", scores(shared),
