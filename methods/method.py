@@ -76,6 +76,21 @@ class History:
 
 
 @dataclass(frozen=True, eq=False)
+class Smooth:
+    """The curves that a method lays through one trajectory's samples, which need not obey the equation.
+
+    Attributes:
+        times: where the method asks for the equation (Q,).
+        share: the share of the whole time that each of them stands for (Q,).
+        levels: u and its time derivatives up to the equation's order, real parts before imaginary ones (order + 1, Q, parts, N).
+    """
+
+    times: Float[ndarray, " point"]
+    share: Float[ndarray, " point"]
+    levels: Float[ndarray, "levels point parts sites"]
+
+
+@dataclass(frozen=True, eq=False)
 class Fit:
     """Coefficients, and how they were had.
 
@@ -93,6 +108,7 @@ class Fit:
         found: what the method found on its way (a threshold, a weight), by name.
         motion: u and, for order 2, v of the fitted motion at the times of each trajectory, where the method follows one; the
             noise that it leaves is then in `found`: noise_u and, where v was seen, noise_v, standard deviations of each real part.
+        smooth: the curves of each trajectory, where the method fits curves and coefficients together.
 
     Raises:
         ValueError: the coefficients do not match the library.
@@ -110,6 +126,7 @@ class Fit:
     history: History | None = None
     found: Mapping[str, float | str] = field(default_factory=dict)
     motion: tuple[Samples, ...] | None = None
+    smooth: tuple[Smooth, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check that there is one coefficient a term."""

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from methods.derivatives import DEGREE, differentiate
-from methods.method import Abilities, Fit, History, Skipped
+from methods.method import Abilities, Fit, History, Skipped, Smooth
 from methods.pinn import (
     Diary,
     Equation,
@@ -212,7 +212,8 @@ class Curve:
     Outputs are the sites' real parts, then for a complex field their imaginary parts. `...` is one axis of members, or nothing.
 
     Attributes:
-        law: the library on the collocation times.
+        times: collocation times.
+        law: the library on them.
         weights: a, the start.
         observed: how many values were observed.
     """
@@ -234,7 +235,7 @@ class Curve:
         """
         self.order, self.size, self.algebra = order, size, algebra
         lead = () if algebra.xp is np else (len(draws),)
-        times = np.linspace(samples.t[0], samples.t[-1], settings.collocation)
+        self.times = times = np.linspace(samples.t[0], samples.t[-1], settings.collocation)
         frequency = size.rate / (size.velocity if order == 2 else size.field)
         drawn = [hidden(times, samples.t, settings.width, settings.bandwidth * frequency, draw) for draw in draws]
         self.grid, self.at = (together(bases, algebra, lead) for bases in zip(*drawn, strict=True))
@@ -313,6 +314,14 @@ class Curve:
         terms = xp.stack(full[: law.count * law.parts]).reshape(law.parts, law.count, *self.blank.shape)
         inner = [rate[..., p * law.sites + law.inner.start : p * law.sites + law.inner.stop] for p in range(law.parts)]
         return terms, xp.stack(inner), full[law.count * law.parts :]
+
+    def smooth(self, a: Array) -> list[Smooth]:
+        """Give the field and its derivatives at the collocation times, one for each member."""
+        bases = (self.grid.value, self.grid.first, self.grid.second)[: self.order + 1]
+        levels = np.stack([host(basis @ a) for basis in bases], axis=-3)
+        share = np.full(len(self.times), 1 / len(self.times))
+        each = levels.reshape(-1, len(bases), len(self.times), self.law.parts, self.law.sites)
+        return [Smooth(self.times, share, one) for one in each]
 
     def misfits(self, a: Array, xi: Array) -> tuple[Array, Array]:
         """Give the sums of squares (...) of the samples' and of the equation's residuals, both scaled by sizes, without w."""
@@ -541,8 +550,9 @@ class PINNVP:
         found = {"weight": best.weight, "noise": math.sqrt(best.score) * size.field}
         found |= spread(np.array([end.coefficients for end in ends]), library)
         return Fit(
-            self.name, library, order, best.coefficients, best.residual, best.stderr, history=best.history, found=found
-        )
+            self.name, library, order, best.coefficients, best.residual, best.stderr, history=best.history, found=found,
+            smooth=best.smooth,
+        )  # fmt: skip
 
     def _solve(self, curves: list[Curve], count: int, since: float) -> list[End]:
         """Go through the weights with one network or the members of a batch; each leaves off where its own score says so."""
@@ -585,10 +595,11 @@ class PINNVP:
         )
         residual = xp.sqrt(xp.where(whole > 0, law / whole, law))
         numbers = [host(one) for one in (least, chosen, found, errors, residual)]
+        smooth = list(zip(*(curve.smooth(a) for curve, a in zip(curves, kept, strict=True)), strict=True))
         return [
             End(
                 float(numbers[0][of]), float(numbers[1][of]), numbers[2][of], numbers[3][of], float(numbers[4][of]),
-                diary.history(of[0] if of else None),
+                diary.history(of[0] if of else None), smooth[of[0] if of else 0],
             )
             for of in np.ndindex(*least.shape)
         ]  # fmt: skip
@@ -642,7 +653,7 @@ class PINNVP:
 
 
 class End(NamedTuple):
-    """Where a member ended: its cross-validation score, weight w, coefficients, standard errors, residual and way there."""
+    """Where a member ended: its cross-validation score, weight w, coefficients, standard errors, residual, way there and curves."""
 
     score: float
     weight: float
@@ -650,6 +661,7 @@ class End(NamedTuple):
     stderr: ndarray
     residual: float
     history: History
+    smooth: tuple[Smooth, ...]
 
 
 METHODS = (PINNVP,)

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from methods.method import Abilities, Fit, History
+from methods.method import Abilities, Fit, History, Smooth
 from methods.trajectory import LEAST_NOISE, Record, approach, prepare, smooth, without_halves
 from systems.lattice import Library
 from systems.samples import Samples
@@ -319,7 +319,7 @@ class Splines:
             sigma = np.where(used < 0.5 * counts, np.maximum(np.sqrt(misfit / (counts - used)), floor), sigma)
             least = min(least, score)
             if score <= least + self.rise:
-                best = (weight, coefficients, covariance, sigma, misfit)
+                best = (weight, coefficients, covariance, sigma, misfit, splines)
             free = float(np.sum(used))
             moved = np.max(np.abs(coefficients - before[0]) / np.sqrt(np.maximum(np.diag(covariance), 1e-300)))
             # Heavier weights change nothing more, or the splines cannot follow the equation any closer.
@@ -330,9 +330,9 @@ class Splines:
             weight *= 10
         status = "ok"
         if best is None:
-            best = (weight, coefficients, np.full((len(coefficients),) * 2, np.nan), sigma, misfit)
+            best = (weight, coefficients, np.full((len(coefficients),) * 2, np.nan), sigma, misfit, splines)
             status = "the fit did not converge; its start is given"
-        weight, coefficients, covariance, noise, misfit = best
+        weight, coefficients, covariance, noise, misfit, splines = best
         found: dict[str, float | str] = {"weight": weight, "noise_u": float(noise[0])}
         if len(noise) > 1:
             found["noise_v"] = float(noise[1])
@@ -345,7 +345,7 @@ class Splines:
         residual = float(np.sqrt(misfit[0] / max(counts[0], 1)) / max(height[0], 1e-300))
         return Fit(
             self.name, library, order, coefficients, residual, stderr=np.sqrt(np.diag(covariance)), status=status,
-            history=history, found=found,
+            history=history, found=found, smooth=tuple(map(_smooth, curves, splines)),
         )  # fmt: skip
 
     def _stage(
@@ -402,6 +402,15 @@ def _start(curves: _Curves, samples: Samples, order: int) -> ndarray:
     matrix = np.concatenate([*rows, 1e-3 * bend])
     target = np.concatenate([*fields, np.zeros((len(bend), dynamics.parts * dynamics.sites))])
     return np.asarray(np.linalg.lstsq(matrix, target, rcond=None)[0]).ravel()
+
+
+def _smooth(curves: _Curves, splines: ndarray) -> Smooth:
+    """Evaluate the splines and their derivatives at the collocation points."""
+    dynamics = curves.record.stretches.dynamics
+    shape = (len(curves.points), dynamics.parts, dynamics.sites)
+    each = splines.reshape(curves.drive.count, -1)
+    levels = [(level @ each).reshape(shape) for level in curves.levels[: dynamics.order + 1]]
+    return Smooth(curves.points, curves.measure, np.stack(levels))
 
 
 def _levels(curves: _Curves, t: ndarray, level: int) -> ndarray:

@@ -432,7 +432,7 @@ def _interpolate(t: ndarray, f: ndarray, grid: ndarray, whole: ndarray) -> ndarr
     return result
 
 
-class _Covariance:
+class Covariance:
     """The Cholesky factor of the weak equations' covariance, a band matrix."""
 
     def __init__(self, form: WeakForm, slopes: Sequence[_Slope], accuracy: float) -> None:
@@ -622,14 +622,7 @@ def _round(
     """Linearise about the states and coefficients, solve for the coefficients, and move the states."""
     designs, targets, pieces = [], [], []
     for form, w in zip(forms, states, strict=True):
-        target, design = form.rows(w)
-        slopes = form.slopes(w, coefficients)
-        if not (np.all(np.isfinite(design)) and all(np.all(np.isfinite(slope.matrix)) for slope in slopes)):
-            raise FloatingPointError("a term is not finite on the data")
-        for slope in slopes:
-            moved = slope.matrix @ (form.state.seen[slope.channel] - w[slope.channel])
-            target[slope.equations] += moved.reshape(-1, form.count)
-        covariance = _Covariance(form, slopes, accuracy)
+        target, design, slopes, covariance = linearised(form, w, coefficients, accuracy)
         designs.append(covariance.whiten(design))
         targets.append(covariance.whiten(target)[:, 0])
         pieces.append((form, slopes, covariance, target, design))
@@ -647,6 +640,30 @@ def _round(
     stderr = np.zeros(len(found))
     stderr[support] = _standard_errors(regression.design[:, support]) * np.sqrt(max(chi2, 1.0))
     return Estimate(found, stderr, regression, chi2, tuple(moved_states), number, settled=False)
+
+
+def linearised(
+    form: WeakForm, w: Float[ndarray, "channels coefficients"], coefficients: Float[ndarray, " terms"], accuracy: float
+) -> tuple[Float[ndarray, "equations tests"], Float[ndarray, "equations tests terms"], list[_Slope], Covariance]:
+    """Give both sides of the weak equations on the seen state, to first order about the state w, and their covariance.
+
+    Args:
+        form: the weak equations of a trajectory.
+        w: the state that the terms are evaluated on.
+        coefficients: xi.
+        accuracy: standard deviation of what quadrature and splines miss.
+
+    Raises:
+        FloatingPointError: a term is not finite.
+    """
+    target, design = form.rows(w)
+    slopes = form.slopes(w, coefficients)
+    if not (np.all(np.isfinite(design)) and all(np.all(np.isfinite(slope.matrix)) for slope in slopes)):
+        raise FloatingPointError("a term is not finite on the data")
+    for slope in slopes:
+        moved = slope.matrix @ (form.state.seen[slope.channel] - w[slope.channel])
+        target[slope.equations] += moved.reshape(-1, form.count)
+    return target, design, slopes, Covariance(form, slopes, accuracy)
 
 
 def _standard_errors(design: ndarray) -> ndarray:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 import methods
 import systems
@@ -13,6 +15,7 @@ from methods.method import Abilities, Fit, Skipped, make, settings, solve
 from systems.errors import InputError
 from systems.lattice import Library, library
 from systems.samples import Samples, SimulatedSamples
+from systems.sensitivity import split_parts
 from systems.simulate import observe, sample_times, simulate
 
 # Settings that make a slow method fast enough for a test; what it finds is not judged here.
@@ -199,3 +202,35 @@ def test_a_method_that_says_so_gives_the_motion_and_the_noise_beside_it(
     if system.order == 2:
         assert np.std(motion.v - samples.exact.v) < 0.8 * np.std(samples.v - samples.exact.v)
         assert "noise_v" in fit.found
+
+
+@pytest.mark.parametrize("data", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", METHODS)
+def test_curves_that_a_method_gives_follow_the_samples_and_their_levels_are_derivatives(
+    name: str, data: str, request: pytest.FixtureRequest
+) -> None:
+    samples = request.getfixturevalue(data)
+    system = systems.find(data)
+    # Derivatives are compared by quadrature over the points where the method asks for the equation: as many as it has by itself.
+    kind = methods.find(name)
+    method = make(kind, {key: value for key, value in QUICK.items() if key in settings(kind) and key != "collocation"})
+    try:
+        fit = solve(method, [samples], system.library("lib2" if data == "phi4" else "four"), system.order, seed=3)
+    except Skipped:
+        return
+    if fit.smooth is None:
+        return
+    (curves,) = fit.smooth
+    parts = 1 + samples.is_complex
+    assert curves.levels.shape == (system.order + 1, len(curves.times), parts, samples.sites)
+    assert np.sum(curves.share) == pytest.approx(1)
+    inner = (samples.t >= curves.times[0]) & (samples.t <= curves.times[-1])
+    there = CubicHermiteSpline(curves.times, curves.levels[0], curves.levels[1])(samples.t[inner])
+    noise = np.std(samples.u - samples.exact.u) / np.sqrt(parts)
+    exact = split_parts(samples.exact.u[inner], samples.is_complex)
+    assert np.sqrt(np.mean((there - exact) ** 2)) < noise
+    for lower, upper in itertools.pairwise(curves.levels):
+        # At the ends, where nothing holds them, they bend too fast for a quadrature.
+        inside = slice(len(lower) // 10, -len(lower) // 10)
+        gone = CubicSpline(curves.times, upper).antiderivative()(curves.times)[inside]
+        np.testing.assert_allclose(gone - gone[0], lower[inside] - lower[inside][0], atol=0.01 * np.max(np.abs(lower)))
