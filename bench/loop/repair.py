@@ -343,8 +343,8 @@ class Horizon:
         levels = 1 if model.order == 1 or data[0].v is None else 2
         least = max(4 * model.order // levels + 2, -(-sum(len(samples.t) for samples in data) // MOST_PIECES))
         lengths = [min(longest, LONGEST)]
-        while lengths[-1] / 2 >= least:
-            lengths.append(-(-lengths[-1] // 2))
+        while lengths[-1] / 3 >= least:
+            lengths.append(-(-lengths[-1] // 3))
         return cls(tuple(data), noise_of_readings(data, model.order, levels), tuple(lengths))
 
     def follows(self, fitted: Fitted) -> bool:
