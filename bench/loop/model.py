@@ -372,6 +372,31 @@ def rates(record: Record, state: State, number: int) -> Float[ndarray, "time ord
     return dynamics.whole(rate, None)
 
 
+def pace(fitted: Fitted) -> float:
+    """Give the angular frequency that a fitted motion has on the whole: RMS of du/dt over that of u about its mean at each site."""
+    change, size = 0.0, 0.0
+    for number, record in enumerate(fitted.records):
+        state = fitted.solution.state
+        u = whole_field(record, state.nodes[number], state.splines[number])[:, 0]
+        change += float(np.sum(rates(record, state, number)[:, 0] ** 2))
+        size += float(np.sum((u - np.mean(u, axis=0)) ** 2))
+    return float(np.sqrt(change / size)) if size > 0 else 0.0
+
+
+def without(fitted: Fitted, number: int) -> Fitted:
+    """Take the change of this number out of a fit's model and its coefficients out of its state; nothing is fitted again."""
+    samples = fitted.data[0]
+    counts = [len(change.forces(samples.sites, samples.is_complex)) for change in fitted.model.changes]
+    begin = len(fitted.model.declared.terms) + sum(counts[:number])
+    state = fitted.solution.state
+    coefficients = np.delete(state.coefficients, np.arange(begin, begin + counts[number]))
+    return replace(
+        fitted,
+        model=fitted.model.without(number),
+        solution=replace(fitted.solution, state=replace(state, coefficients=coefficients)),
+    )
+
+
 def first_fit(
     model: Model, data: Sequence[Samples], steps: int = 40, coefficients: Float[ndarray, " terms"] | None = None
 ) -> Fitted:

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bench.loop.model import Change, Fitted, Model, carried, cut, first_fit, refit
+from bench.loop.model import Change, Fitted, Model, carried, cut, first_fit, pace, refit, without
 from bench.loop.residual import Forecast, alike, dynamics_share, forecast, noise, noise_of_readings, over_noise, pooled
 from bench.loop.tangent import Tangent, linearise
 from bench.loop.trace import Finding, screen
+from bench.loop.ways import SHORTEST_DELAY
 from methods.method import check_fit
 from systems.effects import Effect
 from systems.errors import InputError
@@ -33,8 +34,8 @@ BETTER = 5.0
 # Terms without a name that are fitted in full beside the names in a round, and what share of their evidence in the screen they must have: what
 # is far off the declared equation is screened roughly.
 OTHER_FITS, OTHER_SHARE = 4, 0.6
-# How far behind the best an effect may be in the screen and still be fitted, where the readings are lost and the screen is rough.
-FAR = 20.0
+# How far behind the best an effect may be in the screen and still be fitted: where the readings are lost, and as a share of the evidence.
+FAR, ROUGH = 20.0, 0.15
 # Effects refitted in a round, at most.
 FULL_FITS = 8
 MOST_EFFECTS = 4
@@ -456,10 +457,11 @@ def _contest(
 ) -> list[Candidate]:
     """Fit the best few effects in full and rank all."""
     ranking: list[Candidate] = []
-    best, screened, fits, others = 0.0, 0.0, 0, 0
+    screened, fits, others = 0.0, 0, 0
     for one in findings:
-        # Other ends change the motion by more than to first order.
-        near = one.evidence > best - window or (one.change.ends is not None and one.evidence > EQUAL)
+        # What is plainly visible is screened roughly; and other ends change the motion by more than to first order.
+        behind = max(window, ROUGH * screened)
+        near = one.evidence > screened - behind or (one.change.ends is not None and one.evidence > EQUAL)
         # A term without a name is measured as the names are, where the screen puts it beside them.
         if not one.named:
             near = bool(one.change.texts) and one.evidence > OTHER_SHARE * screened and others < OTHER_FITS
@@ -476,7 +478,7 @@ def _contest(
         again = one if one.random or "step" in one.change.psi else replace(one, gain=gain)
         ranking.append(Candidate(one, gain, again.evidence, again.p, with_it))
         if one.named:
-            fits, best, screened = fits + 1, max(best, again.evidence), max(screened, one.evidence)
+            fits, screened = fits + 1, max(screened, one.evidence)
         else:
             others += 1
     return sorted(ranking, key=lambda one: -one.evidence)
@@ -538,7 +540,7 @@ def settled(fitted: Fitted) -> Fitted:
         rest = _rest(fitted)
         if rest is None:
             continue
-        smaller = _without_coefficients(fitted, number)
+        smaller = without(fitted, number)
         psi = dict(zip(change.psi, (float(x) for x in rest), strict=True))
         changes = list(fitted.model.changes)
         changes[number] = replace(change, as_force=False, psi=psi)
@@ -604,11 +606,22 @@ def _longest(change: Change, name: str, fitted: Fitted) -> float:
 
 
 def _least(change: Change, name: str, fitted: Fitted) -> float:
-    """How far down a parameter may move in one step: what has less than a whole wave in the record is no wave."""
-    if name != "omega":
-        return -np.inf
-    span = max(float(one.t[-1]) for one in fitted.data) - min(float(one.t[0]) for one in fitted.data)
-    return 2 * np.pi / span - change.psi["omega"]
+    """How far down a parameter may move in one step.
+
+    What has less than a whole wave in the record is no wave, and a delay much shorter than the motion's own time no memory.
+    """
+    if name == "omega":
+        span = max(float(one.t[-1]) for one in fitted.data) - min(float(one.t[0]) for one in fitted.data)
+        return 2 * np.pi / span - change.psi["omega"]
+    if name == "delay":
+        return SHORTEST_DELAY / max(pace(fitted), 1e-300) - change.psi["delay"]
+    return -np.inf
+
+
+def _taken_away(fitted: Fitted, number: int) -> Fitted | None:
+    """Fit the model without one of its changes."""
+    smaller = without(fitted, number)
+    return polish(smaller.model, smaller)
 
 
 def _prune(
@@ -618,7 +631,7 @@ def _prune(
     number = 0
     while len(fitted.model.changes) > 1 and number < len(fitted.model.changes) - (not all_of_them):
         change = fitted.model.changes[number]
-        smaller = polish(fitted.model.without(number), _without_coefficients(fitted, number))
+        smaller = _taken_away(fitted, number)
         columns = max(_columns(change, fitted), 1)
         if smaller is not None and fitted.gain(smaller) < 2 * columns * np.log(fitted.count) / 2:
             fitted = smaller
@@ -646,7 +659,7 @@ def _reconsider(
     for number in range(len(fitted.model.changes)):
         own = fitted.model.changes[number]
         watcher(f"reconsidering {own.effect.name}")
-        smaller = polish(fitted.model.without(number), _without_coefficients(fitted, number))
+        smaller = _taken_away(fitted, number)
         if smaller is None or not horizon.follows(smaller):
             # Without it the readings are lost: its place is not in doubt.
             continue
@@ -672,15 +685,3 @@ def _reconsider(
 def _columns(change: Change, fitted: Fitted) -> int:
     samples = fitted.data[0]
     return len(change.forces(samples.sites, samples.is_complex)) + len(change.free)
-
-
-def _without_coefficients(fitted: Fitted, number: int) -> Fitted:
-    """Take one change's coefficients out of a state."""
-    samples = fitted.data[0]
-    begin = len(fitted.model.declared.terms)
-    for change in fitted.model.changes[:number]:
-        begin += len(change.forces(samples.sites, samples.is_complex))
-    count = len(fitted.model.changes[number].forces(samples.sites, samples.is_complex))
-    state = fitted.solution.state
-    coefficients = np.delete(state.coefficients, np.arange(begin, begin + count))
-    return replace(fitted, solution=replace(fitted.solution, state=replace(state, coefficients=coefficients)))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.loop.model import ACCURACY, Fitted, carried, corrected, refit, rows_of
+from bench.loop.model import ACCURACY, Fitted, carried, corrected, refit, rows_of, without
 from methods.derivatives import differentiate
 from methods.trajectory import guess, maximise, tolerances
 from methods.weak import estimate_state
@@ -85,12 +85,12 @@ class DynamicsResidual:
     Attributes:
         t: times.
         left: derivative minus equation (T, parts, M), in units of the derivative.
-        share: RMS of it over the RMS of the derivative, dimensionless.
+        rate: the derivative (T, parts, M).
     """
 
     t: Float[ndarray, " time"]
     left: Float[ndarray, "time parts sites"]
-    share: float
+    rate: Float[ndarray, "time parts sites"]
 
 
 def of_dynamics(fitted: Fitted) -> list[DynamicsResidual]:
@@ -119,18 +119,21 @@ def of_dynamics(fitted: Fitted) -> list[DynamicsResidual]:
         right = dynamics.linear(coefficients, samples.t, states, f, driven, derivatives=False)[0]
         right = right.reshape(len(samples.t), dynamics.order, dynamics.parts, dynamics.count)[:, -1]
         rate = rate[..., dynamics.moving]
-        left = rate - right
-        share = float(np.sqrt(np.nanmean(left**2) / max(float(np.nanmean(rate**2)), 1e-300)))
-        found.append(DynamicsResidual(samples.t, left, share))
+        found.append(DynamicsResidual(samples.t, rate - right, rate))
     return found
 
 
 def dynamics_share(fitted: Fitted) -> float:
-    """Give the share of the derivative that the equation leaves, over all trajectories; NaN where they are too short to smooth."""
+    """Give the share of the derivative that the equation leaves (RMS over RMS, all trajectories together); NaN where they are too short to smooth."""
     try:
-        return float(np.sqrt(np.mean([one.share**2 for one in of_dynamics(fitted)])))
+        every = of_dynamics(fitted)
     except InputError:
         return float("nan")
+    left, rate = (
+        sum(float(np.nansum(part**2)) for part in parts)
+        for parts in zip(*((one.left, one.rate) for one in every), strict=True)
+    )
+    return float(np.sqrt(left / rate)) if rate > 0 else float("nan")
 
 
 # The forecast of what was not fitted ----------------------------------------------------------------------------------------------
@@ -157,7 +160,7 @@ def forecast(fitted: Fitted, held_out: Sequence[Samples] = ()) -> list[Forecast]
     """Predict what was not fitted.
 
     Without other recordings the coefficients are fitted again to the first 70 % of each trajectory, its structure being that of
-    `fitted`, and the rest is predicted. Other recordings give only their starting state: from their own first 30 %.
+    `fitted`, and the rest is predicted; a pulse that comes later cannot be foreseen and is left out. Other recordings give only their starting state: from their own first 30 %.
     """
     if held_out:
         # How a chain ends is known as well as for the recordings that were fitted.
@@ -166,9 +169,10 @@ def forecast(fitted: Fitted, held_out: Sequence[Samples] = ()) -> list[Forecast]
     chosen = (
         [enough[k] for k in np.unique(np.linspace(0, len(enough) - 1, MOST_FORECASTS).astype(int))] if enough else []
     )
-    data = [fitted.data[k] for k in chosen]
     cuts = [max(2, round(len(samples.t) * (1 - HELD_OUT))) for samples in fitted.data]
     early = [rows_of(samples, 0, cut) for samples, cut in zip(fitted.data, cuts, strict=True)]
+    fitted = _foreseeable(fitted, early)
+    data = [fitted.data[k] for k in chosen]
     state = fitted.solution.state
     start = replace(state, nodes=tuple(nodes[:cut] for nodes, cut in zip(state.nodes, cuts, strict=True)))
     again = refit(fitted.model, early, start)
@@ -176,6 +180,15 @@ def forecast(fitted: Fitted, held_out: Sequence[Samples] = ()) -> list[Forecast]
         _predict(again, samples, cuts[number] / len(samples.t), number)
         for number, samples in zip(chosen, data, strict=True)
     ]
+
+
+def _foreseeable(fitted: Fitted, early: Sequence[Samples]) -> Fitted:
+    """Leave out pulses of which the early samples have not seen the middle: nothing is known of their strength."""
+    for number in reversed(range(len(fitted.model.changes))):
+        change = fitted.model.changes[number]
+        if change.effect.acts == "pulse" and not any(one.t[0] <= change.psi["at"] <= one.t[-1] for one in early):
+            fitted = without(fitted, number)
+    return fitted
 
 
 def pooled(forecasts: Sequence[Forecast]) -> float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from bench.loop.model import Change, far_matrix
+from bench.loop.model import Change, far_matrix, pace
 from bench.loop.tangent import Path, Tangent, force_along, forces, orthonormal
 from systems.effects import Effect
 from systems.lattice import Ends
@@ -24,6 +24,8 @@ MOST_FREQUENCIES = 120
 LONG = 400
 PULSES, WIDTHS = 24, (0.02, 0.05, 0.12)
 DELAYS = 10
+# In radians of the motion's own frequency: by less, the past is the present and its derivatives.
+SHORTEST_DELAY = 0.5
 POWERS = tuple(np.arange(0.5, 5.1, 0.25))
 FARTHEST, FARTHEST_OPEN = 8, 24
 # Rounding that makes this share of the noise's variance is named; that readings lie on a grid is no accident, whatever the residual.
@@ -173,7 +175,10 @@ def _late(tangent: Tangent, effect: Effect) -> list[Try | None]:
     past = _histories(tangent)
     times = tangent.paths[0].record.times
     span, step = float(times[-1] - times[0]), float(np.median(np.diff(times)))
-    delays = np.geomspace(1.5 * step, span / 3, DELAYS)
+    shortest = max(1.5 * step, SHORTEST_DELAY / max(pace(tangent.fitted), 1e-300))
+    if shortest >= span / 3:
+        return []
+    delays = np.geomspace(shortest, span / 3, DELAYS)
     return _together(tangent, [Change(effect, texts, {"delay": float(delay)}, past=past) for delay in delays])
 
 
