@@ -372,6 +372,20 @@ def rates(record: Record, state: State, number: int) -> Float[ndarray, "time ord
     return dynamics.whole(rate, None)
 
 
+def strengths(fitted: Fitted) -> Float[ndarray, " terms"]:
+    """Give the RMS of what each term, with its coefficient, contributes to the highest derivative along the fitted motion."""
+    coefficients = fitted.solution.state.coefficients
+    total, count = np.zeros(len(coefficients)), 0
+    for number, record in enumerate(fitted.records):
+        stretches, nodes = record.stretches, fitted.solution.state.nodes[number]
+        f = None if stretches.inputs is None else stretches.inputs(record.times)
+        driven = stretches.driven(record.times, fitted.solution.state.splines[number])
+        values = stretches.dynamics.linear(coefficients, record.times, nodes, f, driven, derivatives=False)[1]
+        total += np.sum((np.moveaxis(values, 1, -1) * coefficients) ** 2, axis=tuple(range(values.ndim - 1)))
+        count += values.size // values.shape[1]
+    return np.asarray(np.sqrt(total / max(count, 1)))
+
+
 def pace(fitted: Fitted) -> float:
     """Give the angular frequency that a fitted motion has on the whole: RMS of du/dt over that of u about its mean at each site."""
     change, size = 0.0, 0.0

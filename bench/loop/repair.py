@@ -9,8 +9,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bench.loop.model import Change, Fitted, Model, carried, cut, first_fit, pace, refit, without
-from bench.loop.residual import Forecast, alike, dynamics_share, forecast, noise, noise_of_readings, over_noise, pooled
+from bench.loop.model import Change, Fitted, Model, carried, cut, first_fit, pace, refit, strengths, without
+from bench.loop.residual import (
+    Forecast,
+    alike,
+    correlation_time,
+    dynamics_share,
+    forecast,
+    noise,
+    noise_of_readings,
+    over_noise,
+    pooled,
+)
 from bench.loop.tangent import Tangent, linearise
 from bench.loop.trace import Finding, screen
 from bench.loop.ways import SHORTEST_DELAY
@@ -34,6 +44,8 @@ BETTER = 5.0
 # Terms without a name that are fitted in full beside the names in a round, and what share of their evidence in the screen they must have: what
 # is far off the declared equation is screened roughly.
 OTHER_FITS, OTHER_SHARE = 4, 0.6
+# So many times the largest declared force is more than a memory can be.
+CANCELLED = 2.0
 # How far behind the best an effect may be in the screen and still be fitted: where the readings are lost, and as a share of the evidence.
 FAR, ROUGH = 20.0, 0.15
 # Effects refitted in a round, at most.
@@ -273,7 +285,7 @@ def close(
             rounds.append(Round(tuple(_unfitted(findings))))
             break
         ranking = _contest(fitted, findings, watcher, 2 * EQUAL if horizon.follows(fitted) else FAR)
-        best = next((one for one in ranking if one.finding.named and one.fitted is not None), None)
+        best, margin = _chosen(ranking)
         count = len(named)
         if best is None or best.fitted is None or best.p * count > FALSE_ALARM:
             rounds.append(Round(tuple(ranking)))
@@ -289,7 +301,7 @@ def close(
             doubted = _Doubted(fitted, tuple(equal), len(rounds), best.evidence, best.evidence + found[1])
         alike = tuple(
             one.name for one in ranking
-            if one is not best and one.finding.named and one.fitted is not None and one.evidence > best.evidence - EQUAL
+            if one is not best and one.finding.named and one.fitted is not None and one.evidence > best.evidence - margin
         )  # fmt: skip
         rival = found if found[1] > EQUAL and horizon.sees_all(fitted) else None
         rounds.append(Round(tuple(ranking), best.name, alike))
@@ -470,7 +482,7 @@ def _contest(
             continue
         watcher(f"fitting {one.name}")
         with_it = polish(fitted.model.with_change(one.change), fitted)
-        if with_it is None:
+        if with_it is None or _cancelled(one.change, with_it, fitted):
             ranking.append(Candidate(one, 0.0, 0.0, 1.0))
             continue
         gain = with_it.gain(fitted)
@@ -484,13 +496,38 @@ def _contest(
     return sorted(ranking, key=lambda one: -one.evidence)
 
 
+def _cancelled(change: Change, with_it: Fitted, fitted: Fitted) -> bool:
+    """Say whether a memory is so strong that the other terms must cancel it: with the present it then makes a derivative."""
+    if change.effect.acts != "delayed":
+        return False
+    own = slice(len(fitted.solution.state.coefficients), None)
+    return bool(np.max(strengths(with_it)[own]) > CANCELLED * np.max(strengths(fitted)))
+
+
+def _chosen(ranking: Sequence[Candidate]) -> tuple[Candidate | None, float]:
+    """Choose the name to add, and say how near others must come to be as good.
+
+    Of those as good as the best the one with the fewest parameters that were searched. What is left of a model that is far off is correlated,
+    and differences count for so much less.
+    """
+    tried = [one for one in ranking if one.finding.named and one.fitted is not None]
+    if not tried or tried[0].fitted is None:
+        return None, EQUAL
+    margin = EQUAL * correlation_time(tried[0].fitted)
+    equal = [one for one in tried if one.evidence > tried[0].evidence - margin]
+    return min(equal, key=lambda one: one.finding.searched), margin
+
+
 def _rival(ranking: Sequence[Candidate], best: Candidate) -> tuple[str, float]:
-    """Find what has no name and does best beside the best name, and by how much it is ahead; full fits are compared with full fits."""
+    """Find what has no name and does best beside the best name, and by how much it is ahead.
+
+    A fit of the name may find a better place or frequency for it than the screen's grid; what is only screened must beat that, too.
+    """
     found = ("", -np.inf)
     for one in ranking:
         if not one.finding.named:
-            lead = one.evidence - (best.evidence if one.fitted is not None else best.finding.evidence)
-            found = max(found, (one.name, float(lead)), key=lambda pair: pair[1])
+            theirs = best.evidence if one.fitted is not None else max(best.evidence, best.finding.evidence)
+            found = max(found, (one.name, float(one.evidence - theirs)), key=lambda pair: pair[1])
     return found
 
 

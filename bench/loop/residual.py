@@ -37,6 +37,7 @@ GLANCE = 1000
 # Of a record in many pieces, so many are forecast.
 MOST_FORECASTS = 8
 FEWEST_ROWS = 4
+LONGEST_LAG = 200
 
 
 def noise(fitted: Fitted) -> Float[ndarray, " levels"]:
@@ -76,6 +77,26 @@ def over_noise(fitted: Fitted, noise: Float[ndarray, " levels"]) -> float:
     counts = fitted.solution.counts
     ratio = (fitted.sigma**2 * dof_share(fitted)) / noise**2
     return float(np.sqrt(np.sum(counts * ratio) / np.sum(counts)))
+
+
+def correlation_time(fitted: Fitted) -> float:
+    """Give how many samples one independent number of the residual takes: 1 + 2 sum of its autocorrelation up to the first zero; at least 1.
+
+    Noise alone gives 1. What a model that is far off leaves goes on from sample to sample, and tells less than its count of numbers.
+    """
+    together: dict[int, float] = {}
+    for left in fitted.residuals():
+        series = left.reshape(len(left), -1)
+        for lag in range(min(len(series), LONGEST_LAG)):
+            together[lag] = together.get(lag, 0.0) + float(np.sum(series[lag:] * series[: len(series) - lag]))
+    if not together.get(0, 0.0) > 0:
+        return 1.0
+    found = 1.0
+    for lag in range(1, len(together)):
+        if together[lag] <= 0:
+            break
+        found += 2 * together[lag] / together[0]
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,6 +66,11 @@ class Finding:
     random: bool = False
 
     @property
+    def searched(self) -> int:
+        """How many of its parameters were searched for: a frequency, a time, a delay."""
+        return len(set(self.change.psi) & set(SEARCHED))
+
+    @property
     def rarity(self) -> float:
         """-ln of the chance p that noise alone does as well somewhere in the search."""
         return rarity(self._tail, self.tries)
