@@ -39,11 +39,13 @@ if TYPE_CHECKING:
 FALSE_ALARM = 0.004
 # Effects whose evidence is this near the best one's cannot be told from it (natural logarithms).
 EQUAL = 3.0
-# So much better must a term without a name be before no name is given.
+# So much better must a term without a name be before no name is given; twice as good where a model loses the readings.
 BETTER = 5.0
 # Terms without a name that are fitted in full beside the names in a round, and what share of their evidence in the screen they must have: what
 # is far off the declared equation is screened roughly.
 OTHER_FITS, OTHER_SHARE = 4, 0.6
+# What acts at its own frequency or time.
+TIMED = ("harmonic", "pulse")
 # So many times the largest declared force is more than a memory can be.
 CANCELLED = 2.0
 # How far behind the best an effect may be in the screen and still be fitted: where the readings are lost, and as a share of the evidence.
@@ -297,7 +299,7 @@ def close(
                 rounds.append(Round(tuple(ranking)))
                 break
             doubted = None
-        elif found[1] > BETTER and horizon.sees_all(fitted):
+        elif found[1] > (BETTER if horizon.sees_all(fitted) else best.evidence):
             doubted = _Doubted(fitted, tuple(equal), len(rounds), best.evidence, best.evidence + found[1])
         alike = tuple(
             one.name for one in ranking
@@ -441,7 +443,7 @@ def _steady(findings: list[Finding]) -> list[Finding]:
 
     Where the readings are lost, a force in step with the motion can stand for nearly anything.
     """
-    steady = [one for one in findings if not one.named or one.change.effect.acts not in ("harmonic", "pulse")]
+    steady = [one for one in findings if not one.named or one.change.effect.acts not in TIMED]
     return steady if any(one.named for one in significant(steady)) else findings
 
 
@@ -471,8 +473,9 @@ def _contest(
     ranking: list[Candidate] = []
     screened, fits, others = 0.0, 0, 0
     for one in findings:
-        # What is plainly visible is screened roughly; and other ends change the motion by more than to first order.
-        behind = max(window, ROUGH * screened)
+        # What is plainly visible is screened roughly; and other ends change the motion by more than to first order. What has a frequency or
+        # a time of its own can stand for nearly anything, and is not given that much.
+        behind = window if one.change.effect.acts in TIMED else max(window, ROUGH * screened)
         near = one.evidence > screened - behind or (one.change.ends is not None and one.evidence > EQUAL)
         # A term without a name is measured as the names are, where the screen puts it beside them.
         if not one.named:
@@ -507,15 +510,15 @@ def _cancelled(change: Change, with_it: Fitted, fitted: Fitted) -> bool:
 def _chosen(ranking: Sequence[Candidate]) -> tuple[Candidate | None, float]:
     """Choose the name to add, and say how near others must come to be as good.
 
-    Of those as good as the best the one with the fewest parameters that were searched. What is left of a model that is far off is correlated,
-    and differences count for so much less.
+    Of those as good as the best one without a parameter that was searched goes before one with. What is left of a model that is far off is
+    correlated, and differences count for so much less.
     """
     tried = [one for one in ranking if one.finding.named and one.fitted is not None]
     if not tried or tried[0].fitted is None:
         return None, EQUAL
     margin = EQUAL * correlation_time(tried[0].fitted)
-    equal = [one for one in tried if one.evidence > tried[0].evidence - margin]
-    return min(equal, key=lambda one: one.finding.searched), margin
+    plain = [one for one in tried if one.evidence > tried[0].evidence - margin and not one.finding.searched]
+    return (plain or tried)[0], margin
 
 
 def _rival(ranking: Sequence[Candidate], best: Candidate) -> tuple[str, float]:
