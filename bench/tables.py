@@ -24,6 +24,8 @@ SCORES = (
 FORMATS = ("csv", "md", "tex")
 # Over fewer seeds a root-mean-square error says little.
 FEW = 3
+# Standard errors to each side of a 95 % interval.
+INTERVAL = 1.96
 TABLES = ("cases", "coefficients", "limits", "summary", "errors")
 MOST_READ = 1000
 # What a row of the matrix is about; a column of it is a method.
@@ -42,7 +44,7 @@ def cases(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
             {
                 "part": case.part, "data": case.data, "library": case.library, "method": case.label, "noise": case.noise,
                 "seed": case.seed, "status": result["status"],
-                **{name: _number(result[name]) for name in SCORES},
+                **{name: _number(result[name]) for name in SCORES}, "covered": _covered(result) if case.noise else np.nan,
                 "reason": result["reason"] or result["note"], "settings": _settings(case.settings), "identity": case.identity,
             }
         )  # fmt: skip
@@ -55,6 +57,7 @@ def cases(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         "seed",
         "status",
         *SCORES,
+        "covered",
         "reason",
         "settings",
         "identity",
@@ -104,13 +107,27 @@ def limits(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(list(rows.values()), columns=[*ABOUT, "term", "truth", "bound", "verdict"])
 
 
+def _covered(result: Mapping[str, Any]) -> float:
+    """Give the share of a case's 95 % intervals that hold the truth; NaN without truth or standard errors.
+
+    Without noise there is nothing that an interval could be of.
+    """
+    errors, truth = result["stderr"], result["truth"]
+    if not errors or not truth or not result["coefficients"]:
+        return np.nan
+    held = [
+        abs(value - truth[term]) <= INTERVAL * _number(errors[term]) for term, value in result["coefficients"].items()
+    ]
+    return float(np.mean(held))
+
+
 def summary(table: pd.DataFrame) -> pd.DataFrame:
     """Sum the table of cases up over seeds: one row for data, library and method.
 
     A case that failed or ran out of time counts as an infinite error and stays in the median; one that was skipped leaves no
     figure. `ok` counts the cases that ended with a fit. `efficiency` is the Cramer-Rao bound over the root-mean-square of E2
     over the seeds: 1 is the best that an unbiased method can do, a failure makes it 0, and with fewer than FEW seeds it is left
-    out. A biased method may pass 1 where the samples say little: 0 for every coefficient is never more than 100 % off.
+    out. `coverage` is the share of the 95 % intervals (1.96 standard errors to each side) that hold the truth. A biased method may pass 1 where the samples say little: 0 for every coefficient is never more than 100 % off.
     """
     if table.empty:
         return pd.DataFrame(columns=[*ABOUT, "method"])
@@ -124,6 +141,8 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     grouped = counted.groupby([*ABOUT, "method"], sort=False)
     found = grouped[[*SCORES]].median()
     found["efficiency"] = grouped[["bound", "e2"]].apply(_efficiency)
+    if "covered" in counted:
+        found["coverage"] = grouped["covered"].mean()
     found.insert(0, "ok", grouped["status"].agg(lambda s: f"{int((s == 'ok').sum())}/{len(s)}"))
     keys = pd.MultiIndex.from_frame(counted[[*ABOUT, "method"]].drop_duplicates())
     return found.reindex(keys).reset_index()
@@ -262,7 +281,7 @@ def read_cases(path: Path) -> pd.DataFrame:
     missing = [name for name in ("identity", "status", "e2") if name not in table]
     if missing:
         raise InputError(f"{path}: not a table of cases: the column {missing[0]!r} is missing")
-    for name in (*SCORES, "noise", "seed"):
+    for name in (*SCORES, "covered", "noise", "seed"):
         if name in table:
             table[name] = pd.to_numeric(table[name], errors="coerce")
     return table

@@ -13,7 +13,7 @@ from bench.case import blank
 from bench.compare import compare
 from bench.provenance import describe, origin
 from bench.suite import Case
-from bench.tables import cases, coefficients, format_number, limits, matrix, publish, read_cases, summary
+from bench.tables import cases, coefficients, format_number, limits, matrix, publish, read_cases, render, summary
 from systems.errors import InputError
 
 ORIGIN = origin()
@@ -59,6 +59,22 @@ def test_a_failure_counts_as_infinite_and_stays_in_the_median_and_a_skip_leaves_
     assert np.isnan(short.loc[("lib1", "c"), "e2"])
     assert short.loc[("lib1", "d"), "e2"] == 0.1
     assert list(short.loc["lib1", "ok"]) == ["2/3", "1/3", "0/3", "3/3"]
+
+
+def test_the_coverage_is_the_share_of_intervals_that_hold_the_truth(tmp_path: Path) -> None:
+    def sure(seed: int, value: float, noise: float = 0.01) -> dict[str, Any]:
+        made = result("a", seed, 0.1)
+        case = {**made["case"], "noise": noise}
+        numbers = {"coefficients": {"u[n]": value, "u[n]**3": 2.0}, "truth": {"u[n]": 1.0, "u[n]**3": 2.0}}
+        return {**made, "case": case, **numbers, "stderr": {"u[n]": 0.1, "u[n]**3": 0.1}}
+
+    noisy = summary(cases([sure(1, 1.19), sure(2, 1.21), sure(3, 0.7), sure(4, 1.0)]))
+    assert list(noisy["coverage"]) == [0.75]
+    assert summary(cases([sure(1, 1.0, 0.0)]))["coverage"].isna().all()
+    text = render(cases([sure(1, 1.19), sure(2, 1.21)]), {}, "csv")
+    (tmp_path / "cases.csv").write_text(text)
+    assert list(summary(read_cases(tmp_path))["coverage"]) == [0.75]
+    assert summary(cases(RESULTS))["coverage"].isna().all()
 
 
 def test_the_efficiency_is_the_bound_over_the_root_mean_square_error_of_the_seeds() -> None:
