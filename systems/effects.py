@@ -56,6 +56,7 @@ class Effect:
         acts: how, see `Acts`.
         real: for complex fields, the coefficient is real; otherwise it is complex: two real ones, of T and i*T.
         orders: of the time derivative that it makes sense for.
+        takes: it only takes energy: the coefficient is negative.
         look_for: what gives it away.
         source: where to read about it.
 
@@ -70,6 +71,7 @@ class Effect:
     complex_field: str | None = None
     real: bool = False
     orders: tuple[int, ...] = (1, 2)
+    takes: bool = False
     look_for: str = ""
     source: str = ""
 
@@ -155,7 +157,7 @@ def load(path: Path) -> tuple[Effect, ...]:
         ):
             raise InputError(f"{where}: orders is {orders!r}; it must be a list of 1 and 2")
         for key, value in entry.items():
-            wanted = bool if key == "real" else list if key == "orders" else str
+            wanted = bool if key in ("real", "takes") else list if key == "orders" else str
             if not isinstance(value, wanted):
                 raise InputError(f"{where}: {key} is {value!r}; it must be a {wanted.__name__}")
         try:
@@ -182,11 +184,11 @@ CATALOGUE: tuple[Effect, ...] = (
         look_for="amplitudes that fall exponentially, alike at all sizes", source=NAYFEH,
     ),
     Effect(
-        "quadratic-drag", "abs(v[n])*v[n]", orders=(2,),
+        "quadratic-drag", "abs(v[n])*v[n]", orders=(2,), takes=True,
         look_for="large swings fall faster than small ones, as one over time", source=NAYFEH,
     ),
     Effect(
-        "dry-friction", "sign(v[n])", orders=(2,),
+        "dry-friction", "sign(v[n])", orders=(2,), takes=True,
         look_for="amplitudes that fall along a straight line, to a stop", source=NAYFEH,
     ),
     Effect(

@@ -485,7 +485,7 @@ def _contest(
             continue
         watcher(f"fitting {one.name}")
         with_it = polish(fitted.model.with_change(one.change), fitted)
-        if with_it is None or _cancelled(one.change, with_it, fitted):
+        if with_it is None or _impossible(one.change, with_it, fitted):
             ranking.append(Candidate(one, 0.0, 0.0, 1.0))
             continue
         gain = with_it.gain(fitted)
@@ -499,12 +499,17 @@ def _contest(
     return sorted(ranking, key=lambda one: -one.evidence)
 
 
-def _cancelled(change: Change, with_it: Fitted, fitted: Fitted) -> bool:
-    """Say whether a memory is so strong that the other terms must cancel it: with the present it then makes a derivative."""
-    if change.effect.acts != "delayed":
-        return False
+def _impossible(change: Change, with_it: Fitted, fitted: Fitted) -> bool:
+    """Say whether a fit makes of an effect what it cannot be.
+
+    A friction that drives is none. Nor is a memory so strong that the other terms must cancel it: with the present it makes a derivative.
+    """
     own = slice(len(fitted.solution.state.coefficients), None)
-    return bool(np.max(strengths(with_it)[own]) > CANCELLED * np.max(strengths(fitted)))
+    if change.effect.takes:
+        return bool(np.any(with_it.solution.state.coefficients[own] > 0))
+    if change.effect.acts == "delayed":
+        return bool(np.max(strengths(with_it)[own]) > CANCELLED * np.max(strengths(fitted)))
+    return False
 
 
 def _chosen(ranking: Sequence[Candidate]) -> tuple[Candidate | None, float]:

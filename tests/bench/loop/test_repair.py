@@ -273,3 +273,23 @@ def test_trajectories_of_different_lengths_are_looked_at_together():
     data = [waves(30, 3, True), waves(10, 3, True, 1), waves(11, 3, True, 2)]
     found = diagnose(library("x", ["u[n]", "u[n]**3"]), 2, data, CATALOGUE)
     assert found.course.verdict == "nothing missing"
+
+
+def test_a_friction_that_drives_is_none():
+    """u'' = -u + 0.02 sign(v), or - 0.02 sign(v), solved piece by piece between the turns: circles about +-0.02."""
+    t = np.linspace(0, 20, 200)
+    draw = np.random.default_rng(8)
+    found = {}
+    for sign in (1, -1):
+        u, v, now, rows = 1.0, 0.0, 0.0, []
+        for turn in np.arange(np.pi, 30, np.pi):
+            centre = sign * 0.02 * (-1 if u > 0 else 1)
+            inside = t[(t >= now) & (t < turn)] - now
+            rows += [(centre + (u - centre) * np.cos(s), -(u - centre) * np.sin(s)) for s in inside]
+            u, now = centre - (u - centre), turn
+        u, v = (np.array(part)[:, None] + 0.002 * draw.normal(size=(len(t), 1)) for part in zip(*rows, strict=True))
+        course = diagnose(library("own", ["u[n]"]), 2, [Samples(t, u, v, ends="free", source="x")], CATALOGUE).course
+        found[sign] = names(course)
+    assert found[-1] == ["dry-friction"]
+    assert "dry-friction" not in found[1]
+    assert "quadratic-drag" not in found[1]
