@@ -149,6 +149,7 @@ BASE = 'name = "first"\nformula = "u[n]"\n\n[[effect]]\n'
         ('name = "mine"\nformula = "u[n]"\norders = [true]', "orders"),
         ('name = "mine"\nformula = ""', "mine"),
         ('name = "mine"\nformula = "u[n]"\nreal = 1', "real"),
+        ('name = "mine"\nformula = "u[n]"\ntakes = "yes"', "takes"),
         ('name = "mine"\nformula = "u[n]"\nlook_for = 1', "look_for"),
     ],
 )
