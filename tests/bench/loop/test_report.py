@@ -117,6 +117,11 @@ class Left(Strict):
     named: bool
 
 
+class Rival(Strict):
+    name: str
+    lead: float = pydantic.Field(gt=0)
+
+
 class Report(Strict):
     declared: dict[str, float]
     declared_before: dict[str, float]
@@ -131,6 +136,7 @@ class Report(Strict):
         Literal["before", "after"], dict[Literal["sites", "times", "frequencies"], list[dict[str, float | int]]]
     ]
     left: list[Left]
+    rival: Rival | None
     notes: list[str]
 
 
