@@ -11,7 +11,7 @@ of the fitted model (`bench.loop.tangent`), each followed by a fit of the rest.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -344,6 +344,12 @@ class Fitted:
         pairs = zip(self.solution.counts, self.solution.misfit, simpler.solution.misfit, strict=True)
         return float(sum(n * spare * np.log(max(b, 1e-300) / max(a, 1e-300)) for n, a, b in pairs if n))
 
+    def curves(self) -> Iterator[tuple[Float[ndarray, " time"], Float[ndarray, "time order parts sites"]]]:
+        """Give times, and u and v of every site at them, for each trajectory."""
+        state = self.solution.state
+        for record, nodes, splines in zip(self.records, state.nodes, state.splines, strict=True):
+            yield record.times, whole_field(record, nodes, splines)
+
     def residuals(self) -> list[Float[ndarray, "time levels parts sites"]]:
         """Give what is left of the readings, 0 where nothing was seen."""
         found = []
@@ -386,14 +392,13 @@ def strengths(fitted: Fitted) -> Float[ndarray, " terms"]:
     return np.asarray(np.sqrt(total / max(count, 1)))
 
 
-def pace(fitted: Fitted) -> float:
-    """Give the angular frequency that a fitted motion has on the whole: RMS of du/dt over that of u about its mean at each site."""
+def pace(curves: Iterable[tuple[Float[ndarray, " time"], Float[ndarray, "time order parts sites"]]]) -> float:
+    """Give the angular frequency that motions have on the whole: RMS of du/dt over that of u about its mean at each site."""
     change, size = 0.0, 0.0
-    for number, record in enumerate(fitted.records):
-        state = fitted.solution.state
-        u = whole_field(record, state.nodes[number], state.splines[number])[:, 0]
-        change += float(np.sum(rates(record, state, number)[:, 0] ** 2))
-        size += float(np.sum((u - np.mean(u, axis=0)) ** 2))
+    for times, states in curves:
+        rate = states[:, 1] if states.shape[1] > 1 else np.gradient(states[:, 0], times, axis=0)
+        change += float(np.sum(rate**2))
+        size += float(np.sum((states[:, 0] - np.mean(states[:, 0], axis=0)) ** 2))
     return float(np.sqrt(change / size)) if size > 0 else 0.0
 
 

@@ -659,7 +659,7 @@ def _least(change: Change, name: str, fitted: Fitted) -> float:
         span = max(float(one.t[-1]) for one in fitted.data) - min(float(one.t[0]) for one in fitted.data)
         return 2 * np.pi / span - change.psi["omega"]
     if name == "delay":
-        return SHORTEST_DELAY / max(pace(fitted), 1e-300) - change.psi["delay"]
+        return SHORTEST_DELAY / max(pace(fitted.curves()), 1e-300) - change.psi["delay"]
     return -np.inf
 
 

@@ -175,7 +175,7 @@ def _late(tangent: Tangent, effect: Effect) -> list[Try | None]:
     past = _histories(tangent)
     times = tangent.paths[0].record.times
     span, step = float(times[-1] - times[0]), float(np.median(np.diff(times)))
-    shortest = max(1.5 * step, SHORTEST_DELAY / max(pace(tangent.fitted), 1e-300))
+    shortest = max(1.5 * step, SHORTEST_DELAY / max(pace((path.times, path.field) for path in tangent.paths), 1e-300))
     if shortest >= span / 3:
         return []
     delays = np.geomspace(shortest, span / 3, DELAYS)

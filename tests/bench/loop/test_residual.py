@@ -28,7 +28,7 @@ def swinging(push=lambda _: 0.0, *, noise=1e-3, span=20.0, start=(1.0, 0.0)):
 
 
 def test_the_pace_of_a_harmonic_motion_is_its_angular_frequency():
-    assert pace(first_fit(Model(OSCILLATOR, 2), [swinging()])) == pytest.approx(OMEGA, rel=0.02)
+    assert pace(first_fit(Model(OSCILLATOR, 2), [swinging()]).curves()) == pytest.approx(OMEGA, rel=0.02)
 
 
 def test_noise_is_independent_from_sample_to_sample_and_what_a_wrong_model_leaves_is_not():
