@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from bench.provenance import describe
 from bench.store import open_store
 from bench.tables import cases, render
 from systems.files import write_text
@@ -13,5 +14,6 @@ KEPT = ["data", "library", "method", "noise", "seed", "status", "e2", "residual"
 
 if __name__ == "__main__":
     store = open_store(Path(sys.argv[1]))
-    table = cases(store.all())[KEPT].sort_values(["data", "library", "method"])
-    write_text(Path(__file__).parent / "baseline.csv", render(table, store.about(), "csv"))
+    found = store.all()
+    table = cases(found)[KEPT].sort_values(["data", "library", "method"])
+    write_text(Path(__file__).parent / "baseline.csv", render(table, describe(found, store.about()), "csv"))
