@@ -45,8 +45,11 @@ if TYPE_CHECKING:
 # Noise below this share of a field's RMS is round-off and integration error.
 LEAST_NOISE = 1e-11
 MAX_HALVINGS = 10
+# Steps that states are given to follow a motion.
+FOLLOW = 20
 # Pieces of this share of a trajectory are fitted before the whole; of at least so many samples where u and v are seen.
 PIECES = (0.1, 0.3)
+GRADUAL_PIECES = (0.1, 0.2, 0.3, 0.5)
 MIN_PIECE = 3
 
 
@@ -529,14 +532,25 @@ def from_weak_form(
     return replace(guess(data, records), coefficients=coefficients) if np.any(coefficients) else None
 
 
-def approach(data: Sequence[Samples], records: Sequence[Record], steps: int) -> State:
+def following(records: Sequence[Record], state: State) -> State:
+    """Let the states follow the motion, the coefficients being held; the same state where no motion is found.
+
+    The first step from noisy states would take their noise for motion, and draw the coefficients towards zero.
+    """
+    found = maximise(records, state, steps=FOLLOW, tolerance=0.1, held=True)
+    return found.state if found.converged else state
+
+
+def approach(
+    data: Sequence[Samples], records: Sequence[Record], steps: int, lengths: Sequence[float] = PIECES
+) -> State:
     """Lead the blind guess near the solution, by fits to pieces of the trajectories, from short to long ones.
 
     A short piece starts anew from states of its own, so that poor coefficients cannot lead its states far astray; longer pieces
-    know the coefficients better. The last fit, to whole trajectories, is left to the caller.
+    know the coefficients better. The last fit, to whole trajectories, is left to the caller. `lengths` are shares of a trajectory.
     """
     state = guess(data, records)
-    for length in PIECES:
+    for length in lengths:
         pieces, nodes, splines = [], [], []
         for record, along, drive in zip(records, state.nodes, state.splines, strict=True):
             count = len(record.times)
@@ -655,6 +669,7 @@ class Trajectory:
         begins = (
             functools.partial(from_weak_form, data, records, library, order, seed),
             functools.partial(approach, data, records, self.steps),
+            functools.partial(approach, data, records, self.steps, GRADUAL_PIECES),
             functools.partial(guess, data, records),
         )
         solution = None
@@ -662,7 +677,7 @@ class Trajectory:
             state = begin()
             if state is None:
                 continue
-            trial = maximise(records, state, steps=self.steps, tolerance=self.tolerance)
+            trial = maximise(records, following(records, state), steps=self.steps, tolerance=self.tolerance)
             if solution is None or trial.converged or not trial.criterion >= solution.criterion:
                 solution = trial
             if solution.converged:
