@@ -412,7 +412,9 @@ def notes(diagnosis: Diagnosis) -> list[str]:
         found.append("The chain's ends were not declared: sites at both ends are taken as given and have no equation.")
     unnamed = [one for one in course.left if not one.named]
     if unnamed and course.verdict in ("unexplained", "partly explained"):
-        listed = ", ".join(one.name for one in unnamed[:3])
+        listed = ", ".join(
+            one.name + ("" if one.change.site is None else f" (site {one.change.site + 1})") for one in unnamed[:3]
+        )
         found.append(f"What would do most for what is left, though it is no effect of the catalogue: {listed}.")
     if course.rival is not None:
         found.append(

@@ -2,13 +2,16 @@
 
 - Single terms that physicists use and the catalogue lacks; they can be fitted in full.
 - Smooth functions of one variable, whatever their form: a force that depends on the field, on the velocity, on a spring's stretch; a declared term that changes
-  in time or from site to site. They are random effects of unknown variance (`bench.loop.trace`).
+  in time or along the chain. They are random effects of unknown variance (`bench.loop.trace`).
+- A declared term that is another from some moment on.
+- Any course in time: of a force at one site or at all of them, of what one site's reading is wrong by.
 - Smooth forces in space and time, and patterns of the residual itself: nets for whatever else there is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,13 +43,18 @@ COMPLEX_TERMS = (
 # Chebyshev polynomials of a smooth function, and half waves of what changes in time.
 DEGREES, HALF_WAVES = 12, 6
 MODES = 6
+# Half waves of a course in time at one place; fewer where the chain is so long that all of its sites would have more columns than this.
+COURSE, MOST_COLUMNS = 12, 1500
+MOMENTS = 16
 
 Group = tuple[str, list[Try]]
 
 
 def unnamed(tangent: Tangent) -> list[Group]:
     """List all of them by what they are called in a ranking."""
-    return [*_terms(tangent), *_bonds(tangent), *_functions(tangent), *_nets(tangent)]
+    return [
+        *_terms(tangent), *_bonds(tangent), *_functions(tangent), *_moments(tangent), *_courses(tangent), *_nets(tangent)
+    ]  # fmt: skip
 
 
 def _parts(path: Path) -> tuple[str, ...]:
@@ -109,11 +117,14 @@ def _functions(tangent: Tangent) -> list[Group]:
         "a force that depends on u": _of_field,
         "a coupling that depends on the stretch": _of_stretch,
         "terms that change in time": _in_time,
+        "terms that change along the chain": _along,
     }
     if dynamics.order == 2:
         kinds["a force that depends on v"] = _of_velocity
     if dynamics.sites < 2 or too_wide(Term("u[n+1]+u[n-1]"), dynamics):
         del kinds["a coupling that depends on the stretch"]
+    if len(places(tangent)) < 2:
+        del kinds["terms that change along the chain"]
     found: list[Group] = []
     for name, make in kinds.items():
         columns = tangent.columns(lambda _, path, make=make: path.answer(make(path)))  # type: ignore[misc]
@@ -165,21 +176,106 @@ def _of_stretch(path: Path) -> ndarray:
     values = np.polynomial.chebyshev.chebvander(x, DEGREES - 1) / (1.0 + np.arange(DEGREES))
     pulls = np.moveaxis(np.sum(values * stretches[..., None], axis=0), -1, 0)
     if dynamics.is_complex:
-        pulls = np.concatenate([pulls, np.stack([-pulls[:, :, 1], pulls[:, :, 0]], axis=2)])
+        pulls = np.concatenate([pulls, _turned(pulls)])
     return np.asarray(pulls)
 
 
-def _in_time(path: Path) -> ndarray:
-    """Give each term of the model, and the field itself, times half waves in time."""
+def _steady(path: Path) -> ndarray:
+    """Give each term of the model that does not know the time, and the field itself: (terms, fine, parts, M); complex ones and turned by i."""
     dynamics = path.record.stretches.dynamics
-    plain = [
-        (term, weights) for term, weights in zip(dynamics.terms, _weights(path), strict=True) if "t" not in term.names
-    ]
-    even = np.ones(dynamics.count)
-    plain += [(Term(f"{part}u[n]"), even) for part in _parts(path)]
-    each = path.sources([term for term, _ in plain]) * np.stack([weights for _, weights in plain])[:, None, None]
-    x = (path.times - path.times[0]) / (path.times[-1] - path.times[0])
+    plain = [(term, own) for term, own in zip(dynamics.terms, _weights(path), strict=True) if "t" not in term.names]
+    plain.append((Term("u[n]"), np.ones(dynamics.count)))
+    each = path.sources([term for term, _ in plain]) * np.stack([own for _, own in plain])[:, None, None]
+    found: list[ndarray] = []
+    for one in each:
+        if not any(np.allclose(one, sign * other) for other in found for sign in (1, -1)):
+            found += [one, _turned(one)] if path.is_complex else [one]
+    return np.stack(found)
+
+
+def _turned(values: ndarray) -> ndarray:
+    """Multiply complex values (..., 2, M) by i."""
+    return np.stack([-values[..., 1, :], values[..., 0, :]], axis=-2)
+
+
+def _in_time(path: Path) -> ndarray:
+    """Give those terms times half waves in time."""
+    each, x = _steady(path), _share(path.times)
     return np.concatenate([each * np.cos(np.pi * k * x)[:, None, None] / k for k in range(1, HALF_WAVES + 1)])
+
+
+def _along(path: Path) -> ndarray:
+    """Give those terms times half waves along the chain."""
+    dynamics = path.record.stretches.dynamics
+    each = _steady(path)
+    place = ((np.arange(dynamics.sites) + 0.5) / dynamics.sites)[dynamics.moving]
+    return np.concatenate([each * np.cos(np.pi * k * place) / k for k in range(1, MODES + 1)])
+
+
+def _share(t: ndarray) -> ndarray:
+    """Give times as shares of a record."""
+    return np.asarray((t - t[0]) / (t[-1] - t[0]))
+
+
+def _moments(tangent: Tangent) -> list[Group]:
+    """Give each of those terms as it would be from some moment on."""
+    begin, end = min(path.times[0] for path in tangent.paths), max(path.times[-1] for path in tangent.paths)
+    moments = np.linspace(begin, end, MOMENTS + 2)[1:-1]
+
+    def columns(_number: int, path: Path) -> ndarray:
+        each = _steady(path)
+        return path.answer(np.concatenate([each * (path.times > moment)[:, None, None] for moment in moments]))
+
+    every = tangent.columns(columns)
+    change, parts = Change(Effect("unnamed", "0")), tangent.paths[0].record.stretches.dynamics.parts
+    tries = [attempt(tangent, change, every[:, k : k + parts]) for k in range(0, every.shape[1], parts)]
+    return _group("a term that changes at one moment", tries)
+
+
+def _courses(tangent: Tangent) -> list[Group]:
+    """Give forces of any course in time, at one site and at all of them, and readings of one site that are wrong by any course."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    moving, sites, parts = places(tangent), dynamics.sites, dynamics.parts
+    waves = min(COURSE, MOST_COLUMNS // (sites * parts))
+    if len(moving) < 2 or waves < HALF_WAVES:
+        return []
+    # The higher, the less likely.
+    rare = 1 + np.repeat(np.arange(waves), parts)
+
+    def forced(_number: int, path: Path) -> ndarray:
+        curves = np.cos(np.pi * np.arange(waves)[:, None] * _share(path.times))
+        source = np.zeros((len(moving), waves, parts, len(path.times), parts, sites))
+        for k, site in enumerate(moving):
+            for part in range(parts):
+                source[k, :, part, :, part, site] = curves
+        return path.answer(source.reshape(-1, *source.shape[3:])[..., dynamics.moving])
+
+    def misread(_number: int, path: Path, level: int) -> ndarray:
+        curves = np.cos(np.pi * np.arange(waves)[:, None] * _share(path.record.times))
+        wrong = np.zeros((sites, waves, parts, *path.weight.shape))
+        for site in range(sites):
+            for part in range(parts):
+                wrong[site, :, part, :, level, part, site] = curves
+        return np.asarray(path.rows(wrong.reshape(-1, *path.weight.shape)))
+
+    change = Change(Effect("unnamed", "0"))
+
+    def at_one(every: ndarray, at: Sequence[int]) -> list[Try | None]:
+        parted = np.split(every, len(at), axis=1)
+        return [
+            attempt(tangent, replace(change, site=site), own / rare, random=True)
+            for site, own in zip(at, parted, strict=True)
+        ]
+
+    every = tangent.columns(forced)
+    groups = [
+        *_group("a force at one site, of any course", at_one(every, moving)),
+        *_group("forces at all sites, of any course", [attempt(tangent, change, every, random=True)]),
+    ]
+    for level in range(tangent.paths[0].weight.shape[1]):
+        every = tangent.columns(lambda k, path, level=level: misread(k, path, level))  # type: ignore[misc]
+        groups += _group(f"readings of {'uv'[level]} at one site wrong by any course", at_one(every, range(sites)))
+    return groups
 
 
 def _weights(path: Path) -> ndarray:
@@ -197,7 +293,7 @@ def _nets(tangent: Tangent) -> list[Group]:
     modes = [np.cos(np.pi * k * place) for k in range(min(MODES, sites))]
 
     def smooth(_number: int, path: Path, low: int, high: int) -> ndarray:
-        x = (path.times - path.times[0]) / (path.times[-1] - path.times[0])
+        x = _share(path.times)
         sources = []
         for k in range(low, high):
             for mode in modes:

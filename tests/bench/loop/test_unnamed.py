@@ -74,6 +74,46 @@ def test_a_stiffness_that_changes_in_time_is_a_sum_of_half_waves():
     assert left_by(unnamed._in_time(path), ((x - 0.5)[:, None] * u)[:, None]) < FAITHFUL
 
 
+def test_a_coupling_that_changes_along_the_chain_is_a_sum_of_half_waves():
+    path = tangent_of("phi4").paths[0]
+    u = path.fields()[0]
+    right = np.concatenate([u[:, 1:], u[:, -1:]], axis=1) - u
+    left = np.concatenate([u[:, :1], u[:, :-1]], axis=1) - u
+    n = np.linspace(-1, 1, u.shape[1])
+    assert left_by(unnamed._along(path), (np.tanh(2 * n) * (right + left))[:, None]) < FAITHFUL
+
+
+def test_complex_terms_change_with_any_phase_and_none_counts_twice():
+    path = tangent_of("ginzburg-landau").paths[0]
+    each = unnamed._steady(path)
+    assert len(each) == np.linalg.matrix_rank(each.reshape(len(each), -1)) == 6
+
+
+@pytest.mark.parametrize(
+    ("effect", "name"),
+    [
+        ("other: sudden-coupling", "a term that changes at one moment"),
+        ("other: late-push", "a force at one site, of any course"),
+    ],
+)
+def test_what_begins_late_is_found_as_such(effect, name):
+    found = screen(tangent_of("dnls", effect, 40.0), CATALOGUE, np.random.default_rng(0), 40)
+    assert found[0].name == name
+
+
+@pytest.mark.parametrize("name", ["phi4", "ginzburg-landau"])
+def test_a_sensor_that_drifts_is_found_at_its_site(name):
+    tangent = tangent_of(name)
+    path = tangent.paths[0]
+    wrong = np.zeros(path.weight.shape)
+    wrong[:, 0, 0, 3] = np.linspace(-1, 1, len(wrong)) ** 3
+    column = tangent.new(path.free(path.rows(wrong[None])))[:, 0]
+    drifting = replace(tangent, residual=tangent.residual + 30 * column / np.linalg.norm(column))
+    found = screen(drifting, CATALOGUE, np.random.default_rng(0), 40)[0]
+    assert found.name == "readings of u at one site wrong by any course"
+    assert found.change.site == 3
+
+
 @pytest.mark.parametrize(
     ("effect", "name"),
     [("other: wavy-drag", "a force that depends on v"), ("other: uneven-bonds", "uneven bonds")],
