@@ -13,10 +13,10 @@ bench: $(READY)
 	$(BIN)/latticebench run default --results runs/default
 
 test: $(READY)
-	$(BIN)/python -m pytest -m "not slow" --benchmark-disable
+	$(BIN)/python -m pytest -m "not slow" --benchmark-disable -n 2 --dist worksteal
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -m slow --benchmark-disable
+	$(BIN)/python -m pytest -m slow --benchmark-disable -n 2 --dist worksteal
 
 speed: $(READY)
 	$(BIN)/python -m pytest tests/speed --benchmark-only

@@ -235,7 +235,7 @@ class Dynamics:
         """The terms of dry friction."""
         if self.order == 1 or self.is_complex:
             return ()
-        return tuple(k for k, term in enumerate(self.terms) if term.text.replace(" ", "") == "sign(v[n])")
+        return tuple(k for k, term in enumerate(self.terms) if term.jumps)
 
     def _softened(
         self,

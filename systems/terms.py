@@ -305,6 +305,11 @@ class Term:
         return frozenset(node.id for node in bare if isinstance(node, ast.Name))
 
     @property
+    def jumps(self) -> bool:
+        """Whether it is dry friction, sign(v[n]), which jumps where a site turns round."""
+        return self.text.replace(" ", "") == "sign(v[n])"
+
+    @property
     def expression(self) -> sympy.Expr:
         """The SymPy expression over the complex symbols u_{n+1}, v_{n}, ... and the real ones t and n."""
         return symbolic(self.text)

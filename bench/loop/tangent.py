@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 # Steps between two samples where one Runge-Kutta step was enough, and at most.
 FINE = 2
 FINEST = 8
-FRICTION = "sign(v[n])"
 # A column that keeps less than this of its length has nothing of its own to say.
 VISIBLE = 1e-5
 
@@ -255,9 +254,9 @@ def force_along(path: Path, forces: Sequence[Force], coefficients: ndarray | Non
     """Evaluate forces along a path: their sum (fine, parts, sites) with coefficients, or each (forces, fine, parts, sites)."""
     dynamics = path.record.stretches.dynamics
     texts = list(dict.fromkeys(force.term.text for force in forces))
-    values = dict(zip(texts, path.sources([read_term(text) for text in texts]), strict=True))
-    if FRICTION in values:
-        values[FRICTION] = path.turning()
+    terms = [read_term(text) for text in texts]
+    values = dict(zip(texts, path.sources(terms), strict=True))
+    values |= {term.text: path.turning() for term in terms if term.jumps}
     found = []
     for force in forces:
         value = values[force.term.text]
