@@ -65,7 +65,8 @@ class Drawn:
 
     Attributes:
         about: single numbers: the `site` (0, ..., N-1), frequency `omega` and `phase` of a drive, middle `at` and `width` of a pulse,
-            `delay`, power `s` of a long-range coupling, and the `middle` of the record.
+            `delay`, power `s` of a long-range coupling, the `middle` of the record; for `BLIND`: `wave_number` of a travelling
+            force, `spot`, `speed` and `breadth` of a moving one, frequency `own` of a resonator, and `warming`, a sensor's time.
         n: place of each site, counted from the chain's middle (N,).
         far: long-range coupling of the sites (N, N).
         bond: one bond's force (N, N).
@@ -137,6 +138,18 @@ class Moment:
         about = self.drawn.about
         return float(np.exp(-(((self.t - about["at"]) / about["width"]) ** 2) / 2))
 
+    def spot(self) -> ndarray:
+        """Give the bell that moves along the chain, at each site."""
+        about = self.drawn.about
+        place = about["spot"] + about["speed"] * (self.t - about["middle"])
+        return np.asarray(np.exp(-(((self.drawn.n - place) / about["breadth"]) ** 2) / 2))
+
+    def travelling(self) -> ndarray:
+        """Give the travelling wave at each site."""
+        about = self.drawn.about
+        angle = about["wave_number"] * self.drawn.n - about["omega"] * self.t + about["phase"]
+        return np.asarray(np.exp(1j * angle) if self.chain.is_complex else np.cos(angle))
+
 
 Fields = tuple["ndarray", "ndarray | None"]
 
@@ -187,24 +200,43 @@ PUSHES: dict[str, Callable[[Moment], ndarray]] = {
     "other: uneven-bonds": lambda m: m.drawn.bonds @ m.u,
     "other: sudden-coupling": lambda m: float(m.t > m.drawn.about["at"]) * (m.stretch(1) + m.stretch(-1)),
     "other: late-push": lambda m: float(m.t > m.drawn.about["at"]) * np.eye(len(m.u))[m.drawn.site],
+    # Nothing of the catalogue, of the blind set.
+    "other: lopsided-bonds": lambda m: m.stretch(1) ** 2 - m.stretch(-1) ** 2,
+    "other: moving-spot": lambda m: m.spot() * m.u,
+    "other: plane-wave": lambda m: m.travelling(),
+    "other: phase-conjugation": lambda m: np.conj(m.u),
 }
 
-ONLY_SECOND = ("other: cubic-drag", "other: friction-between", "other: wavy-drag")
+# The second set from outside the catalogue, made by somebody who had not looked at the diagnosis: those that push or act through what
+# is not seen, then those of the instrument.
+BLIND_MOTIONS = (
+    "other: lopsided-bonds", "other: moving-spot", "other: plane-wave", "other: phase-conjugation", "other: side-resonator",
+    "other: retarded-coupling",
+)  # fmt: skip
+BLIND_READINGS = (
+    "other: drifting-sensor", "other: neighbour-crosstalk", "other: slow-sensor", "other: clipped-reading",
+)  # fmt: skip
+BLIND = (*BLIND_MOTIONS, *BLIND_READINGS)
+
+ONLY_SECOND = ("other: cubic-drag", "other: friction-between", "other: wavy-drag", "other: lopsided-bonds")
+ONLY_COMPLEX = ("other: phase-conjugation",)
 READINGS = ("sensor-offset", "sensor-gain", "sensor-curve", "clock", "quantisation")
-OTHERS = tuple(name for name in PUSHES if name.startswith("other: "))
+OTHERS = (*(name for name in PUSHES if name.startswith("other: ") and name not in BLIND), *BLIND)
 # Effects of complex fields whose size is a real number all the same.
-REAL = ("damping", "nonlinear-loss", "gain-loss", "disorder", "unequal-masses", "ends", *READINGS)
+REAL = ("damping", "nonlinear-loss", "gain-loss", "disorder", "unequal-masses", "ends", *READINGS, *BLIND_READINGS)
 # Without a size of their own.
 FIXED = ("ends", "quantisation")
 # Steps to the amount of an effect that has the size: to first order, then with the declared equation fitted, to within CLOSE.
 FIRST_ORDER, REFITS, CLOSE = 6, 6, 0.1
-MADE = (NONE, *PUSHES, *READINGS, "ends", "unequal-masses", "known-input", "memory")
+# Steps between two samples in which a slow sensor follows.
+FINE = 40
+MADE = tuple(dict.fromkeys((NONE, *PUSHES, *READINGS, "ends", "unequal-masses", "known-input", "memory", *BLIND)))
 
 
 def sensible(name: str, system: System) -> bool:
     """Say whether an effect is one that this system's declared equation lacks and that makes sense for it."""
     if name in OTHERS:
-        return system.order == 2 or name not in ONLY_SECOND
+        return (system.order == 2 or name not in ONLY_SECOND) and (system.is_complex or name not in ONLY_COMPLEX)
     effect = find(name)
     texts = effect.texts(system.order, system.is_complex)
     if not texts or (name == "known-input" and system.is_complex):
@@ -401,6 +433,16 @@ def _drawn(name: str, sites: int, times: ndarray, draw: np.random.Generator) -> 
     bonds = np.diag(strengths, 1) + np.diag(strengths, -1)
     bonds -= np.diag(bonds.sum(axis=1))
     shape = np.stack([draw.uniform(1.0, 5.0, size=3), draw.uniform(0, 2 * np.pi, size=3)])
+    # From a generator of their own, so that nothing else changes what it draws.
+    more = np.random.default_rng(shape.view(np.uint64).ravel().tolist())
+    about |= {
+        "wave_number": more.choice([-1.0, 1.0]) * more.uniform(0.6, 2.4),
+        "spot": sites * more.uniform(-0.15, 0.15),
+        "speed": more.choice([-1.0, 1.0]) * more.uniform(0.3, 1.0) * sites / span,
+        "breadth": more.uniform(1.0, 2.5),
+        "own": more.uniform(1.0, 4.0),
+        "warming": span * more.uniform(0.1, 0.4),
+    }
     return Drawn(about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force)
 
 
@@ -408,8 +450,6 @@ def _run(
     chain: Motion, start: ndarray, times: ndarray, push: Callable[[float, ndarray, ndarray], ndarray] | None
 ) -> Fields:
     """Integrate the chain with a push, which is given t, u and v (u for order 1)."""
-    from scipy.integrate import solve_ivp
-
     rate = chain.right_hand_side
     size = chain.parts * chain.sites
 
@@ -421,13 +461,20 @@ def _run(
             change[-size:] += np.concatenate([extra.real, extra.imag]) if chain.is_complex else extra
         return change
 
+    return chain.unpack(_integrated(forced, start, times))
+
+
+def _integrated(rate: Callable[[float, ndarray], ndarray], start: ndarray, times: ndarray) -> ndarray:
+    """Integrate real equations (states, T)."""
+    from scipy.integrate import solve_ivp
+
     found = solve_ivp(
-        forced, (times[0], times[-1]), start, t_eval=times, method="DOP853", rtol=1e-9, atol=1e-10,
+        rate, (times[0], times[-1]), start, t_eval=times, method="DOP853", rtol=1e-9, atol=1e-10,
         max_step=0.1 * float(times[-1] - times[0]),
     )  # fmt: skip
     if found.status != 0 or not np.all(np.isfinite(found.y)):
         raise InputError("the motion is unbounded")
-    return chain.unpack(found.y)
+    return np.asarray(found.y)
 
 
 def _disturbed(name: str, amount: complex, chain: Motion, start: ndarray, times: ndarray, drawn: Drawn) -> Fields:
@@ -443,13 +490,24 @@ def _disturbed(name: str, amount: complex, chain: Motion, start: ndarray, times:
         force = CubicSpline(times, drawn.force)
         return _run(chain, start, times, lambda t, _u, _v: amount * force(t))
     if name == "memory":
-        return _with_memory(amount, chain, start, times, float(drawn.about["delay"]))
+        return _with_memory(lambda past, _: amount * past, chain, start, times, float(drawn.about["delay"]))
+    if name == "other: retarded-coupling":
+
+        def late(past: ndarray, u: ndarray) -> ndarray:
+            before = Moment(0.0, past, past, chain, drawn)
+            return np.asarray(amount * (before.neighbour(1) + before.neighbour(-1) - 2 * u))
+
+        return _with_memory(late, chain, start, times, float(drawn.about["delay"]))
+    if name == "other: side-resonator":
+        return _with_resonator(amount, chain, start, times, drawn.site, float(drawn.about["own"]))
     if name == "ends":
         return _run(replace(chain, ends=_other(chain.ends)), start, times, None)
     if name == "clock":
         assert drawn.late is not None
         return _read_late(chain, start, times, float(np.real(amount)) * drawn.late)
-    return _misread(name, float(np.real(amount)), drawn.site, *_run(chain, start, times, None))
+    if name == "other: slow-sensor":
+        return _read_slowly(chain, start, times, float(np.real(amount)), drawn.site)
+    return _misread(name, float(np.real(amount)), drawn, times, *_run(chain, start, times, None))
 
 
 def _other(ends: Ends) -> Ends:
@@ -469,9 +527,9 @@ def _scaled(chain: Motion, site: int, amount: float) -> Callable[[float, ndarray
     return push
 
 
-def _misread(name: str, size: float, site: int, u: ndarray, v: ndarray | None) -> Fields:
+def _misread(name: str, size: float, drawn: Drawn, times: ndarray, u: ndarray, v: ndarray | None) -> Fields:
     """Give what a sensor that lies shows of a field; rounding comes after the noise."""
-    one = np.eye(u.shape[1])[site]
+    one = np.eye(u.shape[1])[drawn.site]
     if name == "sensor-offset":
         return u + size * one, v
     if name == "sensor-gain":
@@ -479,6 +537,21 @@ def _misread(name: str, size: float, site: int, u: ndarray, v: ndarray | None) -
     if name == "sensor-curve":
         bent = u + size * (np.abs(u) if np.iscomplexobj(u) else u) * u
         return bent, None if v is None else v * (1 + 2 * size * u)
+    if name == "other: drifting-sensor":
+        # It warms up. Velocities have a sensor of their own, which is sound.
+        drift = 1 - np.exp(-(times - times[0]) / drawn.about["warming"])
+        return u + size * drift[:, None] * one, v
+    if name == "other: neighbour-crosstalk":
+        # Of sensors side by side, of which those at the ends have one neighbour. Velocities come through the same wires.
+        beside = np.eye(u.shape[1], k=1) + np.eye(u.shape[1], k=-1)
+        return u + size * u @ beside, None if v is None else v + size * v @ beside
+    if name == "other: clipped-reading":
+        # All have one range, and each part of a complex field has it. Velocities have sensors of their own, whose range suffices.
+        # The root, as what is lost grows faster than the range shrinks.
+        limit = max(np.max(np.abs(u.real)), np.max(np.abs(u.imag))) / (1 + np.sqrt(size))
+        if np.iscomplexobj(u):
+            return np.clip(u.real, -limit, limit) + 1j * np.clip(u.imag, -limit, limit), v
+        return np.clip(u, -limit, limit), v
     return u, v
 
 
@@ -491,12 +564,55 @@ def _read_late(chain: Motion, start: ndarray, times: ndarray, late: ndarray) -> 
     return u[rows], None if v is None else v[rows]
 
 
+def _read_slowly(chain: Motion, start: ndarray, times: ndarray, lag: float, site: int) -> Fields:
+    """Give the field as it is when one sensor follows it with y' = (u - y) / lag; velocities have a sensor of their own, which is sound.
+
+    Between the steps of a fine grid the field is taken as straight, for which this is exact.
+    """
+    grid = np.interp(np.arange(FINE * (len(times) - 1) + 1) / FINE, np.arange(len(times)), times)
+    u, v = _run(chain, start, grid, None)
+    seen, shown = u[:, site], u[:, site].copy()
+    for k, step in enumerate(np.diff(grid)):
+        behind = lag * (seen[k + 1] - seen[k]) / step
+        shown[k + 1] = seen[k + 1] - behind + (shown[k] - seen[k] + behind) * np.exp(-step / lag)
+    u[:, site] = shown
+    return u[::FINE], None if v is None else v[::FINE]
+
+
+def _with_resonator(amount: complex, chain: Motion, start: ndarray, times: ndarray, site: int, own: float) -> Fields:
+    """Integrate with something unseen hung on one site, which pulls it by amount (w - u).
+
+    Its own motion is w'' = own^2 (u - w), or w' = own (u - w), times i for a complex field; it starts as the site does.
+    """
+    rate, size = chain.right_hand_side, chain.parts * chain.sites
+    turn = 1j if chain.is_complex else 1.0
+
+    def coupled(t: float, y: ndarray) -> ndarray:
+        change, u = rate(t, y[:-4]), chain.unpack(y[:-4])[0][site]
+        w, speed = y[-4:].view(complex)
+        pull = amount * (w - u)
+        change[-size + site] += pull.real
+        if chain.is_complex:
+            change[-size + chain.sites + site] += pull.imag
+        hidden = [speed, own**2 * (u - w)] if chain.order == 2 else [turn * own * (u - w), 0.0]
+        return np.concatenate([change, np.array(hidden, complex).view(float)])
+
+    u, v = chain.unpack(start)
+    hidden = np.array([u[site], 0.0 if v is None else v[site]], complex).view(float)
+    return chain.unpack(_integrated(coupled, np.concatenate([start, hidden]), times)[:-4])
+
+
 def _always(field: ndarray, _: float) -> ndarray:
     return field
 
 
-def _with_memory(amount: complex, chain: Motion, start: ndarray, times: ndarray, delay: float) -> Fields:
-    """Integrate in steps of one delay: within one, the past is known. Before the start the field was what it was then."""
+def _with_memory(
+    late: Callable[[ndarray, ndarray], ndarray], chain: Motion, start: ndarray, times: ndarray, delay: float
+) -> Fields:
+    """Integrate in steps of one delay: within one, the past is known. Before the start the field was what it was then.
+
+    The push is given the field as it was and as it is.
+    """
     from scipy.interpolate import CubicSpline
 
     rows: dict[float, ndarray] = {}
@@ -505,8 +621,8 @@ def _with_memory(amount: complex, chain: Motion, start: ndarray, times: ndarray,
     for begin, end in itertools.pairwise(np.append(np.arange(times[0], times[-1], delay), times[-1])):
         grid = np.unique(np.concatenate([np.linspace(begin, end, 60), times[(times >= begin) & (times <= end)]]))
 
-        def push(t: float, _u: ndarray, _v: ndarray, past: Callable[[float], ndarray] = past) -> ndarray:
-            return np.asarray(amount * past(t - delay))
+        def push(t: float, u: ndarray, _v: ndarray, past: Callable[[float], ndarray] = past) -> ndarray:
+            return np.asarray(late(past(t - delay), u))
 
         u, v = _run(chain, y, grid, push)
         for k, t in enumerate(grid):

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 import systems
 from bench.loop.model import Model, first_fit
-from bench.loop.specimen import FIXED, MADE, NONE, OTHERS, make, sensible
+from bench.loop.specimen import BLIND, FIXED, MADE, NONE, OTHERS, make, sensible
 from systems.effects import CATALOGUE
 from systems.errors import InputError
 from systems.lattice import library
@@ -30,7 +31,8 @@ EVERY = [
 SOME = [
     ("phi4", "drive"), ("phi4", "long-range"), ("phi4", "ends"), ("phi4", "known-input"), ("phi4", "clock"),
     ("phi4", "sensor-curve"), ("phi4", "other: noise-force"), ("dnls", "disorder"), ("dnls", "unequal-masses"),
-    ("dnls", "memory"), ("dnls", "quantisation"), ("dnls", "sensor-offset"),
+    ("dnls", "memory"), ("dnls", "quantisation"), ("dnls", "sensor-offset"), ("phi4", "other: moving-spot"),
+    ("phi4", "other: slow-sensor"), ("dnls", "other: side-resonator"), ("dnls", "other: retarded-coupling"),
 ]  # fmt: skip
 
 
@@ -116,7 +118,13 @@ def truth_of(name):
     return system.truth(system.library("equation"), {})
 
 
-@pytest.mark.parametrize("effect", ["damping", "drive", "defect", "next-neighbour", "unequal-masses", "gradient"])
+@pytest.mark.parametrize(
+    "effect",
+    [
+        "damping", "drive", "defect", "next-neighbour", "unequal-masses", "gradient", "other: lopsided-bonds", "other: moving-spot",
+        "other: plane-wave",
+    ],
+)  # fmt: skip
 def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
     one = drawn("phi4", effect, z=40, noise=0.05)
     amount, about = np.real(one.amount), one.about
@@ -138,6 +146,12 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
         "next-neighbour": lambda _t, u, _v: far(u),
         "unequal-masses": lambda _t, u, _v: at * own(u),
         "gradient": lambda _t, u, _v: n + 0 * u,
+        "other: lopsided-bonds": lambda _t, u, _v: np.diff(u, append=u[-1]) ** 2 - np.diff(u, prepend=u[0]) ** 2,
+        "other: moving-spot": lambda t, u, _v: (
+            np.exp(-0.5 * ((n - about["spot"] - about["speed"] * (t - np.mean(one.clean.t))) / about["breadth"]) ** 2)
+            * u
+        ),
+        "other: plane-wave": lambda t, _u, _v: np.cos(about["wave_number"] * n - about["omega"] * t + about["phase"]),
     }
 
     def rate(t, y):
@@ -150,16 +164,25 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
     np.testing.assert_allclose(one.clean.v, y[:, 7:], atol=1e-6)
 
 
-@pytest.mark.parametrize(("effect", "turn"), [("nonlinear-loss", -1), ("asymmetric-coupling", 1)])
+@pytest.mark.parametrize(
+    ("effect", "turn"), [("nonlinear-loss", -1), ("asymmetric-coupling", 1), ("other: phase-conjugation", 1), ("other: plane-wave", 1)]
+)  # fmt: skip
 def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
     one = drawn("dnls", effect, z=40, noise=0.05)
     coupling, cubic = truth_of("dnls")
+    about = one.about
+    extras = {
+        "nonlinear-loss": lambda _, u: abs(u) ** 2 * u,
+        "asymmetric-coupling": lambda _, u: (np.append(u[1:], u[-1]) - np.append(u[0], u[:-1])) / 2,
+        "other: phase-conjugation": lambda _, u: u.real - 1j * u.imag,
+        "other: plane-wave": lambda t, _: np.exp(
+            1j * (about["wave_number"] * (np.arange(7) - 3.0) - about["omega"] * t + about["phase"])
+        ),
+    }
 
-    def rate(_, u):
+    def rate(t, u):
         beside = neighbours(u)
-        extra = (
-            abs(u) ** 2 * u if effect == "nonlinear-loss" else (np.append(u[1:], u[-1]) - np.append(u[0], u[:-1])) / 2
-        )
+        extra = extras[effect](t, u)
         return 1j * coupling * (beside - 2 * u) + 1j * cubic * abs(u) ** 2 * u + turn * one.amount * extra
 
     t = one.clean.t
@@ -169,8 +192,9 @@ def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
     np.testing.assert_allclose(one.clean.u, u, atol=1e-6)
 
 
-def test_the_field_remembers_what_it_was_a_delay_ago():
-    one = drawn("phi4", "memory", z=60, noise=0.05, samples=400)
+@pytest.mark.parametrize("effect", ["memory", "other: retarded-coupling"])
+def test_the_field_remembers_what_it_was_a_delay_ago(effect):
+    one = drawn("phi4", effect, z=60, noise=0.05, samples=400)
     t, delay, amount = one.clean.t, one.about["delay"], np.real(one.amount)
     xi = truth_of("phi4")
     u = one.clean.u
@@ -179,10 +203,107 @@ def test_the_field_remembers_what_it_was_a_delay_ago():
     acceleration = (one.clean.v[2:] - one.clean.v[:-2]) / (t[2:] - t[:-2])[:, None]
     own = np.array([xi[0] * (neighbours(row) - 2 * row) + xi[1] * row + xi[2] * row**3 for row in u])[inside]
     past = np.stack([np.interp(t[inside] - delay, t, column) for column in u.T], axis=1)
+    if effect != "memory":
+        past = np.array([neighbours(row) for row in past]) - 2 * u[inside]
     left = acceleration - own
     slope = np.sum(left * past) / np.sum(past**2)
     assert slope == pytest.approx(amount, rel=0.02)
     assert np.std(left - amount * past) < 0.05 * np.std(left)
+
+
+def test_a_resonator_that_is_not_seen_pulls_its_site():
+    one = drawn("phi4", "other: side-resonator", z=40, noise=0.05)
+    amount, own, site = np.real(one.amount), one.about["own"], int(one.about["site"])
+    xi = truth_of("phi4")
+
+    def rate(_, y):
+        u, v, (w, speed) = y[:7], y[7:14], y[14:]
+        force = xi[0] * (neighbours(u) - 2 * u) + xi[1] * u + xi[2] * u**3
+        force[site] += amount * (w - u[site])
+        return np.concatenate([v, force, [speed, own**2 * (u[site] - w)]])
+
+    t, u, v = one.clean.t, one.clean.u, one.clean.v
+    start = np.concatenate([u[0], v[0], [u[0, site], v[0, site]]])
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(u, y[:, :7], atol=1e-6)
+    np.testing.assert_allclose(v, y[:, 7:14], atol=1e-6)
+
+
+def test_a_complex_resonator_turns_at_its_own_frequency():
+    one = drawn("dnls", "other: side-resonator", z=40, noise=0.05)
+    own, site = one.about["own"], int(one.about["site"])
+    coupling, cubic = truth_of("dnls")
+
+    def rate(_, y):
+        u, w = y[:7], y[7]
+        change = 1j * coupling * (neighbours(u) - 2 * u) + 1j * cubic * abs(u) ** 2 * u
+        change[site] += one.amount * (w - u[site])
+        return np.append(change, 1j * own * (u[site] - w))
+
+    t, start = one.clean.t, np.append(one.clean.u[0], one.clean.u[0, site]).astype(complex)
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(one.clean.u, y[:, :7], atol=1e-6)
+
+
+# Instruments that lie ------------------------------------------------------------------------------------------------------------
+
+
+def lied(name, effect, **options):
+    """What is read, what there was, and what is said of it; velocities are read as they are but for crosstalk."""
+    one, plain = drawn(name, effect, z=40, **options), drawn(name, NONE, **options)
+    if plain.clean.v is not None and effect != "other: neighbour-crosstalk":
+        assert np.array_equal(one.clean.v, plain.clean.v)
+    assert np.imag(one.amount) == 0
+    return one.clean.u, plain.clean.u, one
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_drifting_sensor_warms_up(name):
+    shown, true, one = lied(name, "other: drifting-sensor")
+    site, t = int(one.about["site"]), one.clean.t
+    drift = shown - true
+    assert np.max(np.abs(np.delete(drift, site, axis=1))) == 0
+    # What is still missing of the whole falls by the same factor in the same time.
+    missing = 1 - drift[:, site].real / np.real(one.amount)
+    np.testing.assert_allclose(np.log(missing), -(t - t[0]) / one.about["warming"], atol=1e-6)
+    assert np.max(np.abs(drift.imag)) == 0
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_crosstalk_is_of_sensors_side_by_side(name):
+    shown, true, one = lied(name, "other: neighbour-crosstalk")
+    amount = np.real(one.amount)
+    pairs = [(shown, true)] if name == "dnls" else [(shown, true), (one.clean.v, drawn(name, NONE).clean.v)]
+    for mixed, own in pairs:
+        np.testing.assert_allclose(mixed[:, 3] - own[:, 3], amount * (own[:, 2] + own[:, 4]), atol=1e-12)
+        np.testing.assert_allclose(mixed[:, 0] - own[:, 0], amount * own[:, 1], atol=1e-12)
+        np.testing.assert_allclose(mixed[:, 6] - own[:, 6], amount * own[:, 5], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_slow_sensor_follows_the_field_as_an_rc_filter(name):
+    shown, true, one = lied(name, "other: slow-sensor", samples=100)
+    site, lag, t = int(one.about["site"]), np.real(one.amount), one.clean.t
+    assert np.max(np.abs(np.delete(shown - true, site, axis=1))) < 1e-7
+    # The convolution with exp(-t / lag) / lag, of the field between the samples as a spline has it.
+    field = CubicSpline(t, true[:, site])
+    for k in (25, 60, 99):
+        back = np.linspace(0, t[k] - t[0], 20001)
+        weight = np.exp(-back / lag) / lag
+        filtered = np.trapezoid(weight * field(t[k] - back), back) + true[0, site] * np.exp(-back[-1] / lag)
+        assert abs(shown[k, site] - filtered) < 0.01 * np.max(np.abs(shown - true))
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_clipped_reading_stays_within_its_range(name):
+    shown, true, _ = lied(name, "other: clipped-reading")
+    parts = [(shown.real, true.real)] if name == "phi4" else [(shown.real, true.real), (shown.imag, true.imag)]
+    limit = max(np.max(np.abs(part)) for part, _ in parts)
+    assert limit < 0.99 * max(np.max(np.abs(part)) for _, part in parts)
+    for part, own in parts:
+        inside = np.abs(own) <= limit
+        assert np.array_equal(part[inside], own[inside])
+        np.testing.assert_allclose(part[~inside], np.sign(own[~inside]) * limit, rtol=1e-12)
 
 
 def test_making_one_does_not_call_the_dynamics_that_fits_use(monkeypatch):
@@ -233,6 +354,13 @@ def test_what_the_equation_has_already_is_no_effect_of_it(name):
     if system.order == 1:
         assert not lacking & {"dry-friction", "quadratic-drag"}
     assert {other for other in OTHERS if sensible(other, system)} >= {"other: weak-bond", "other: saturation"}
+
+
+def test_the_blind_set_is_outside_the_catalogue_and_beside_the_first():
+    assert len(OTHERS) == len(set(OTHERS)) == 12 + len(BLIND)
+    assert set(BLIND) < set(OTHERS) <= set(MADE)
+    assert not sensible("other: phase-conjugation", systems.find("phi4"))
+    assert not sensible("other: lopsided-bonds", systems.find("dnls"))
 
 
 def test_every_effect_of_the_catalogue_can_be_made():
