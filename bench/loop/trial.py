@@ -3,7 +3,7 @@
 A suite file (TOML) has a `title` and any number of tables
 
     [[made]]                       # every combination of the lists is a trial
-    effects = ["catalogue"]        # names; "catalogue": all that make sense; "outside"; "none"; "a+b": two at once
+    effects = ["catalogue"]        # names; "catalogue": all that make sense; "outside", "blind": faults that are none of it; "none"; "a+b": two at once
     systems = ["phi4"]
     noise = [0.01]
     z = [5, 10, 30]
@@ -60,6 +60,7 @@ HERE = Path(__file__).parent / "suites"
 OFF_SIZE = 0.2
 OWN_SIZE = ("ends", "quantisation")
 KNOWN = tuple(effect.name for effect in CATALOGUE)
+GROUPS = {"catalogue": KNOWN, "outside": specimen.OTHERS, "blind": specimen.BLIND}
 
 
 class _Model(pydantic.BaseModel):
@@ -143,13 +144,13 @@ def load(name: str) -> tuple[str, list[Trial]]:
 
 
 def _expand(grid: _Grid, where: str) -> Iterator[Made]:
-    known = [specimen.NONE, *(effect.name for effect in CATALOGUE), *specimen.OTHERS]
+    known = [specimen.NONE, *KNOWN, *specimen.OTHERS]
     for system in grid.systems:
         found = systems.find(system)
         effects: list[str] = []
         for name in grid.effects:
-            if name in ("catalogue", "outside"):
-                pool = specimen.OTHERS if name == "outside" else [effect.name for effect in CATALOGUE]
+            if name in GROUPS:
+                pool = GROUPS[name]
                 effects += [one for one in pool if specimen.sensible(one, found)]
                 continue
             for part in name.split("+"):
