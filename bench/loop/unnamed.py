@@ -43,8 +43,8 @@ COMPLEX_TERMS = (
 # Chebyshev polynomials of a smooth function, and half waves of what changes in time.
 DEGREES, HALF_WAVES = 12, 6
 MODES = 6
-# Half waves of a course in time at one place; fewer where the chain is so long that all of its sites would have more columns than this.
-COURSE, MOST_COLUMNS = 12, 1500
+# Half waves of a course in time at one place; fewer where the columns of all sites would be more numbers than this.
+COURSE, MOST_NUMBERS = 12, 20_000_000
 MOMENTS = 16
 
 Group = tuple[str, list[Try]]
@@ -236,7 +236,7 @@ def _courses(tangent: Tangent) -> list[Group]:
     """Give forces of any course in time, at one site and at all of them, and readings of one site that are wrong by any course."""
     dynamics = tangent.paths[0].record.stretches.dynamics
     moving, sites, parts = places(tangent), dynamics.sites, dynamics.parts
-    waves = min(COURSE, MOST_COLUMNS // (sites * parts))
+    waves = min(COURSE, MOST_NUMBERS // (len(tangent.residual) * sites * parts))
     if len(moving) < 2 or waves < HALF_WAVES:
         return []
     # The higher, the less likely.
@@ -244,11 +244,13 @@ def _courses(tangent: Tangent) -> list[Group]:
 
     def forced(_number: int, path: Path) -> ndarray:
         curves = np.cos(np.pi * np.arange(waves)[:, None] * _share(path.times))
-        source = np.zeros((len(moving), waves, parts, len(path.times), parts, sites))
-        for k, site in enumerate(moving):
+        found = []
+        for site in moving:
+            source = np.zeros((waves, parts, len(path.times), parts, sites))
             for part in range(parts):
-                source[k, :, part, :, part, site] = curves
-        return path.answer(source.reshape(-1, *source.shape[3:])[..., dynamics.moving])
+                source[:, part, :, part, site] = curves
+            found.append(path.answer(source.reshape(-1, *source.shape[2:])[..., dynamics.moving]))
+        return np.concatenate(found, axis=1)
 
     def misread(_number: int, path: Path, level: int) -> ndarray:
         curves = np.cos(np.pi * np.arange(waves)[:, None] * _share(path.record.times))
