@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -183,14 +184,27 @@ def _of_stretch(path: Path) -> ndarray:
 def _steady(path: Path) -> ndarray:
     """Give each term of the model that does not know the time, and the field itself: (terms, fine, parts, M); complex ones and turned by i."""
     dynamics = path.record.stretches.dynamics
-    plain = [(term, own) for term, own in zip(dynamics.terms, _weights(path), strict=True) if "t" not in term.names]
-    plain.append((Term("u[n]"), np.ones(dynamics.count)))
-    each = path.sources([term for term, _ in plain]) * np.stack([own for _, own in plain])[:, None, None]
-    found: list[ndarray] = []
-    for one in each:
-        if not any(np.allclose(one, sign * other) for other in found for sign in (1, -1)):
-            found += [one, _turned(one)] if path.is_complex else [one]
-    return np.stack(found)
+    own = [
+        (term, weights) for term, weights in zip(dynamics.terms, _weights(path), strict=True) if "t" not in term.names
+    ]
+    own.append((Term("u[n]"), np.ones(dynamics.count)))
+    plain = [own[k] for k in _distinct(tuple(term.text for term, _ in own))]
+    each = path.sources([term for term, _ in plain]) * np.stack([weights for _, weights in plain])[:, None, None]
+    return np.concatenate([np.stack([one, _turned(one)]) for one in each]) if path.is_complex else each
+
+
+@functools.cache
+def _distinct(texts: tuple[str, ...]) -> tuple[int, ...]:
+    """Give the numbers of the terms that are not an earlier one times 1, -1, i or -i."""
+    import sympy
+
+    found: list[int] = []
+    expressions = [Term(text).expression for text in texts]
+    for k, one in enumerate(expressions):
+        turns = (one - factor * expressions[j] for j in found for factor in (1, -1, sympy.I, -sympy.I))
+        if not any(sympy.expand(turn) == 0 for turn in turns):
+            found.append(k)
+    return tuple(found)
 
 
 def _turned(values: ndarray) -> ndarray:
