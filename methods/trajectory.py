@@ -6,8 +6,8 @@ the linearised problem, condensed to the start of each trajectory and the coeffi
 (1981); see `systems.sensitivity`). The states start from the smoothed samples, so that a poor first guess of the coefficients
 does no harm: no trajectory is followed for longer than from one sample to the next.
 
-- Start: a smoothing spline's values and slopes for the states, the weak form's coefficients (`methods.weak`); where that leads
-  nowhere, least squares on the motion from sample to sample, led on by fits to short pieces.
+- Start: a smoothing spline's values and slopes for the states, the weak form's coefficients (`methods.weak`), with which the states
+  are fitted first; where that leads nowhere, least squares on the motion from sample to sample, led on by fits to short pieces.
 - Noise: the standard deviations of u and v are estimated from what the fit leaves, and weigh the two in the next step.
 - Unknown ends: the sites whose stencil is not whole have no equation. Their motion is a B-spline in time of unknown
   coefficients, fitted together with everything else to their own samples; how many B-splines is decided before the fit, by
