@@ -11,7 +11,7 @@ it again, by the Gauss-Newton step that the tangent gives; the same search over 
 The largest value of a search has an exponential tail; the surrogates say how many independent tries the search amounts to, so
 that p-values far below one over the number of surrogates make sense.
 
-What has no name (`bench.loop.unnamed`) is tried beside the catalogue. It is no verdict, but where some of it does much better than every effect that has
+What has no name (`bench.loop.unnamed`, `bench.loop.misreadings`) is tried beside the catalogue. It is no verdict, but where some of it does much better than every effect that has
 a name, none of the names is right.
 """
 
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import special
 
+from bench.loop.misreadings import misreadings
 from bench.loop.model import Change
 from bench.loop.tangent import Tangent
 from bench.loop.unnamed import unnamed
@@ -127,7 +128,7 @@ def screen(
         found = ways(tangent, effect)
         if found:
             groups.append((effect.name, True, found))
-    groups += [(name, False, tries) for name, tries in unnamed(tangent)]
+    groups += [(name, False, tries) for name, tries in (*unnamed(tangent), *misreadings(tangent))]
     return rank(tangent, groups, draw, surrogates)
 
 

@@ -1,18 +1,17 @@
-"""Ways for something without a name to be there, that compete with the catalogue's effects.
+"""Ways for a motion without a name to be there, that compete with the catalogue's effects (readings without one: `bench.loop.misreadings`).
 
 - Single terms that physicists use and the catalogue lacks; they can be fitted in full.
 - Smooth functions of one variable, whatever their form: a force that depends on the field, on the velocity, on a spring's stretch; a declared term that changes
-  in time or along the chain. They are random effects of unknown variance (`bench.loop.trace`).
+  in time, along the chain, or in both. They are random effects of unknown variance (`bench.loop.trace`).
 - A declared term that is another from some moment on.
-- Any course in time: of a force at one site or at all of them, of what one site's reading is wrong by.
-- Smooth forces in space and time, and patterns of the residual itself: nets for whatever else there is.
+- A force of any course in time, at one site or at all of them, and one that travels as a wave.
+- Smooth forces in space and time: nets for whatever else there is.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,15 +46,16 @@ MODES = 6
 # Half waves of a course in time at one place; fewer where the columns of all sites would be more numbers than this.
 COURSE, MOST_NUMBERS = 12, 20_000_000
 MOMENTS = 16
+# Whole waves in the record and half waves along the chain of a travelling force, at most.
+WAVES, STANDING = 12, 24
 
 Group = tuple[str, list[Try]]
 
 
 def unnamed(tangent: Tangent) -> list[Group]:
     """List all of them by what they are called in a ranking."""
-    return [
-        *_terms(tangent), *_bonds(tangent), *_functions(tangent), *_moments(tangent), *_courses(tangent), *_nets(tangent)
-    ]  # fmt: skip
+    kinds = (_terms, _bonds, _functions, _moments, _courses, _waves, _nets)
+    return [found for kind in kinds for found in kind(tangent)]
 
 
 def _parts(path: Path) -> tuple[str, ...]:
@@ -106,8 +106,8 @@ def _bonds(tangent: Tangent) -> list[Group]:
     each = len(parts)
     tries = [attempt(tangent, change, every[:, j * each : (j + 1) * each]) for j in range(len(left_ones))]
     return [
-        *_group("another bond", tries),
-        *_group("uneven bonds", [attempt(tangent, change, every, random=True)]),
+        *group("another bond", tries),
+        *group("uneven bonds", [attempt(tangent, change, every, random=True)]),
     ]
 
 
@@ -119,26 +119,27 @@ def _functions(tangent: Tangent) -> list[Group]:
         "a coupling that depends on the stretch": _of_stretch,
         "terms that change in time": _in_time,
         "terms that change along the chain": _along,
+        "terms that change in time and along the chain": _in_both,
     }
     if dynamics.order == 2:
         kinds["a force that depends on v"] = _of_velocity
     if dynamics.sites < 2 or too_wide(Term("u[n+1]+u[n-1]"), dynamics):
         del kinds["a coupling that depends on the stretch"]
     if len(places(tangent)) < 2:
-        del kinds["terms that change along the chain"]
+        del kinds["terms that change along the chain"], kinds["terms that change in time and along the chain"]
     found: list[Group] = []
     for name, make in kinds.items():
         columns = tangent.columns(lambda _, path, make=make: path.answer(make(path)))  # type: ignore[misc]
         length = np.linalg.norm(columns, axis=0)
         # Equal visibility for each, but for what is too small to be seen.
         kept = length > 1e-6 * np.max(length, initial=0.0)
-        found += _group(name, [attempt(tangent, Change(Effect("unnamed", "0")), columns[:, kept], random=True)])
+        found += group(name, [attempt(tangent, Change(Effect("unnamed", "0")), columns[:, kept], random=True)])
     return found
 
 
-def _polynomials(size: ndarray, factor: ndarray) -> ndarray:
-    """Give Chebyshev polynomials of a variable's size times a factor: (degrees, fine, N); higher ones are less likely."""
-    x = 2 * size / max(float(np.max(size)), 1e-300) - 1
+def polynomials(size: ndarray, factor: ndarray, largest: float) -> ndarray:
+    """Give Chebyshev polynomials of a variable between 0 and its largest size, times a factor: (degrees, fine, N); higher ones are less likely."""
+    x = 2 * size / max(largest, 1e-300) - 1
     values = np.polynomial.chebyshev.chebvander(x, DEGREES - 1)
     return np.asarray(np.moveaxis(values / (1.0 + np.arange(DEGREES)), -1, 0) * factor)
 
@@ -157,14 +158,14 @@ def _sources(path: Path, values: ndarray) -> ndarray:
 def _of_field(path: Path) -> ndarray:
     u = path.fields()[0]
     if path.is_complex:
-        return _sources(path, _polynomials(np.abs(u), u))
-    return _sources(path, _polynomials(u - np.min(u), np.ones_like(u)))
+        return _sources(path, polynomials(np.abs(u), u, float(np.max(np.abs(u)))))
+    return _sources(path, polynomials(u - np.min(u), np.ones_like(u), float(np.ptp(u))))
 
 
 def _of_velocity(path: Path) -> ndarray:
     v = path.fields()[1]
     assert v is not None
-    return _sources(path, _polynomials(v - np.min(v), np.ones_like(v)))
+    return _sources(path, polynomials(v - np.min(v), np.ones_like(v), float(np.ptp(v))))
 
 
 def _of_stretch(path: Path) -> ndarray:
@@ -177,7 +178,7 @@ def _of_stretch(path: Path) -> ndarray:
     values = np.polynomial.chebyshev.chebvander(x, DEGREES - 1) / (1.0 + np.arange(DEGREES))
     pulls = np.moveaxis(np.sum(values * stretches[..., None], axis=0), -1, 0)
     if dynamics.is_complex:
-        pulls = np.concatenate([pulls, _turned(pulls)])
+        pulls = np.concatenate([pulls, turned(pulls)])
     return np.asarray(pulls)
 
 
@@ -190,7 +191,7 @@ def _steady(path: Path) -> ndarray:
     own.append((Term("u[n]"), np.ones(dynamics.count)))
     plain = [own[k] for k in _distinct(tuple(term.text for term, _ in own))]
     each = path.sources([term for term, _ in plain]) * np.stack([weights for _, weights in plain])[:, None, None]
-    return np.concatenate([np.stack([one, _turned(one)]) for one in each]) if path.is_complex else each
+    return np.concatenate([np.stack([one, turned(one)]) for one in each]) if path.is_complex else each
 
 
 @functools.cache
@@ -207,14 +208,14 @@ def _distinct(texts: tuple[str, ...]) -> tuple[int, ...]:
     return tuple(found)
 
 
-def _turned(values: ndarray) -> ndarray:
+def turned(values: ndarray) -> ndarray:
     """Multiply complex values (..., 2, M) by i."""
     return np.stack([-values[..., 1, :], values[..., 0, :]], axis=-2)
 
 
 def _in_time(path: Path) -> ndarray:
     """Give those terms times half waves in time."""
-    each, x = _steady(path), _share(path.times)
+    each, x = _steady(path), share(path.times)
     return np.concatenate([each * np.cos(np.pi * k * x)[:, None, None] / k for k in range(1, HALF_WAVES + 1)])
 
 
@@ -226,7 +227,15 @@ def _along(path: Path) -> ndarray:
     return np.concatenate([each * np.cos(np.pi * k * place) / k for k in range(1, MODES + 1)])
 
 
-def _share(t: ndarray) -> ndarray:
+def _in_both(path: Path) -> ndarray:
+    """Give those terms times products of both."""
+    each, along = _steady(path), _along(path)
+    x = share(path.times)
+    waves = range(1, HALF_WAVES)
+    return np.concatenate([some * np.cos(np.pi * k * x)[:, None, None] / k for some in (each, along) for k in waves])
+
+
+def share(t: ndarray) -> ndarray:
     """Give times as shares of a record."""
     return np.asarray((t - t[0]) / (t[-1] - t[0]))
 
@@ -243,55 +252,77 @@ def _moments(tangent: Tangent) -> list[Group]:
     every = tangent.columns(columns)
     change, parts = Change(Effect("unnamed", "0")), tangent.paths[0].record.stretches.dynamics.parts
     tries = [attempt(tangent, change, every[:, k : k + parts]) for k in range(0, every.shape[1], parts)]
-    return _group("a term that changes at one moment", tries)
+    return group("a term that changes at one moment", tries)
+
+
+def course(tangent: Tangent) -> int:
+    """Say of how many half waves a course in time at one place is made; 0 where there are too few, or no places."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    waves = min(COURSE, MOST_NUMBERS // (len(tangent.residual) * dynamics.sites * dynamics.parts))
+    return waves if len(places(tangent)) > 1 and waves >= HALF_WAVES else 0
+
+
+def at_each(tangent: Tangent, every: ndarray, sites: Sequence[int], waves: int) -> list[Try | None]:
+    """Try courses in time at one site after the other; the higher half waves are less likely."""
+    found = []
+    for site, own in zip(sites, np.split(every, len(sites), axis=1), strict=True):
+        rare = 1 + np.repeat(np.arange(waves), own.shape[1] // waves)
+        found.append(attempt(tangent, Change(Effect("unnamed", "0"), site=site), own / rare, random=True))
+    return found
 
 
 def _courses(tangent: Tangent) -> list[Group]:
-    """Give forces of any course in time, at one site and at all of them, and readings of one site that are wrong by any course."""
+    """Give forces of any course in time, at one site and at all of them."""
     dynamics = tangent.paths[0].record.stretches.dynamics
-    moving, sites, parts = places(tangent), dynamics.sites, dynamics.parts
-    waves = min(COURSE, MOST_NUMBERS // (len(tangent.residual) * sites * parts))
-    if len(moving) < 2 or waves < HALF_WAVES:
+    moving, parts, waves = places(tangent), dynamics.parts, course(tangent)
+    if not waves:
         return []
-    # The higher, the less likely.
-    rare = 1 + np.repeat(np.arange(waves), parts)
 
-    def forced(_number: int, path: Path) -> ndarray:
-        curves = np.cos(np.pi * np.arange(waves)[:, None] * _share(path.times))
+    def columns(_number: int, path: Path) -> ndarray:
+        curves = np.cos(np.pi * np.arange(waves)[:, None] * share(path.times))
         found = []
         for site in moving:
-            source = np.zeros((waves, parts, len(path.times), parts, sites))
+            source = np.zeros((waves, parts, len(path.times), parts, dynamics.sites))
             for part in range(parts):
                 source[:, part, :, part, site] = curves
             found.append(path.answer(source.reshape(-1, *source.shape[2:])[..., dynamics.moving]))
         return np.concatenate(found, axis=1)
 
-    def misread(_number: int, path: Path, level: int) -> ndarray:
-        curves = np.cos(np.pi * np.arange(waves)[:, None] * _share(path.record.times))
-        wrong = np.zeros((sites, waves, parts, *path.weight.shape))
-        for site in range(sites):
-            for part in range(parts):
-                wrong[site, :, part, :, level, part, site] = curves
-        return np.asarray(path.rows(wrong.reshape(-1, *path.weight.shape)))
-
-    change = Change(Effect("unnamed", "0"))
-
-    def at_one(every: ndarray, at: Sequence[int]) -> list[Try | None]:
-        parted = np.split(every, len(at), axis=1)
-        return [
-            attempt(tangent, replace(change, site=site), own / rare, random=True)
-            for site, own in zip(at, parted, strict=True)
-        ]
-
-    every = tangent.columns(forced)
-    groups = [
-        *_group("a force at one site, of any course", at_one(every, moving)),
-        *_group("forces at all sites, of any course", [attempt(tangent, change, every, random=True)]),
+    every = tangent.columns(columns)
+    whole = attempt(tangent, Change(Effect("unnamed", "0")), every, random=True)
+    return [
+        *group("a force at one site, of any course", at_each(tangent, every, moving, waves)),
+        *group("forces at all sites, of any course", [whole]),
     ]
-    for level in range(tangent.paths[0].weight.shape[1]):
-        every = tangent.columns(lambda k, path, level=level: misread(k, path, level))  # type: ignore[misc]
-        groups += _group(f"readings of {'uv'[level]} at one site wrong by any course", at_one(every, range(sites)))
-    return groups
+
+
+def _waves(tangent: Tangent) -> list[Group]:
+    """Give forces that run along the chain as a wave, or stand."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    sites, parts = dynamics.sites, dynamics.parts
+    highest = min(WAVES, (min(len(path.record.times) for path in tangent.paths) - 1) // 2)
+    lengths = range(2, min(STANDING, sites) + 1, 2)
+    if len(places(tangent)) < 4 or len(tangent.residual) * highest * len(lengths) * 4 * parts > MOST_NUMBERS:
+        return []
+    n = np.arange(sites) - (sites - 1) / 2
+
+    def columns(_number: int, path: Path) -> ndarray:
+        x = share(path.times)
+        found = []
+        for k in range(1, highest + 1):
+            beats = np.stack([np.cos(2 * np.pi * k * x), np.sin(2 * np.pi * k * x)])
+            for q in lengths:
+                shapes = np.stack([np.cos(np.pi * q * n / sites), np.sin(np.pi * q * n / sites)])
+                source = np.zeros((2, 2, parts, len(x), parts, sites))
+                for part in range(parts):
+                    source[:, :, part, :, part] = beats[:, None, :, None] * shapes[:, None]
+                found.append(source.reshape(-1, *source.shape[3:])[..., dynamics.moving])
+        return np.concatenate([path.answer(some) for some in found], axis=1)
+
+    every = tangent.columns(columns)
+    change, each = Change(Effect("unnamed", "0")), 4 * parts
+    tries = [attempt(tangent, change, every[:, k : k + each]) for k in range(0, every.shape[1], each)]
+    return group("a wave of force along the chain", tries)
 
 
 def _weights(path: Path) -> ndarray:
@@ -300,51 +331,37 @@ def _weights(path: Path) -> ndarray:
     return np.asarray(weights[:, dynamics.moving])
 
 
-def _nets(tangent: Tangent) -> list[Group]:
-    """Give smooth forces in space and time, and patterns of the residual itself."""
-    dynamics = tangent.paths[0].record.stretches.dynamics
-    change = Change(Effect("unnamed", "0"))
-    sites = dynamics.sites
+def modes_of(sites: int) -> list[ndarray]:
+    """Give half waves along a chain."""
     place = (np.arange(sites) + 0.5) / sites
-    modes = [np.cos(np.pi * k * place) for k in range(min(MODES, sites))]
+    return [np.cos(np.pi * k * place) for k in range(min(MODES, sites))]
+
+
+def _nets(tangent: Tangent) -> list[Group]:
+    """Give smooth forces in space and time."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    sites = dynamics.sites
 
     def smooth(_number: int, path: Path, low: int, high: int) -> ndarray:
-        x = _share(path.times)
+        x = share(path.times)
         sources = []
         for k in range(low, high):
-            for mode in modes:
+            for mode in modes_of(sites):
                 for part in range(dynamics.parts):
                     source = np.zeros((len(x), dynamics.parts, sites))
                     source[:, part] = np.cos(np.pi * k * x)[:, None] * mode
                     sources.append(source[..., dynamics.moving])
         return path.answer(np.stack(sources))
 
-    def pattern(_number: int, path: Path, level: int, low: int, high: int) -> ndarray:
-        rows = len(path.record.times)
-        x = (np.arange(rows) + 0.5) / rows
-        columns = []
-        for k in range(low, high):
-            for mode in modes:
-                for part in range(dynamics.parts):
-                    wrong = np.zeros(path.weight.shape)
-                    wrong[:, level, part] = np.cos(np.pi * k * x)[:, None] * mode
-                    columns.append(wrong)
-        return path.rows(np.stack(columns))
-
     groups: list[Group] = []
     for low, high in ((0, 3), (3, 9), (9, 18)):
         columns = tangent.columns(lambda k, path, a=low, b=high: smooth(k, path, a, b))  # type: ignore[misc]
         name = f"a smooth force, {low}-{high - 1} half waves in time"
-        groups += _group(name, [attempt(tangent, change, columns, random=True)])
-    for level in range(tangent.paths[0].weight.shape[1]):
-        for low, high in ((0, 4), (4, 12)):
-            columns = tangent.columns(lambda k, path, c=level, a=low, b=high: pattern(k, path, c, a, b))  # type: ignore[misc]
-            name = f"a pattern in {'uv'[level]}, {low}-{high - 1} half waves in time"
-            groups += _group(name, [attempt(tangent, change, columns)])
+        groups += group(name, [attempt(tangent, Change(Effect("unnamed", "0")), columns, random=True)])
     return groups
 
 
-def _group(name: str, tries: Sequence[Try | None]) -> list[Group]:
+def group(name: str, tries: Sequence[Try | None]) -> list[Group]:
     """Give a group of what can be tried, if there is any."""
     found = [one for one in tries if one is not None]
     return [(name, found)] if found else []

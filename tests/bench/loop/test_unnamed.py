@@ -101,17 +101,21 @@ def test_what_begins_late_is_found_as_such(effect, name):
     assert found[0].name == name
 
 
-@pytest.mark.parametrize("name", ["phi4", "ginzburg-landau"])
-def test_a_sensor_that_drifts_is_found_at_its_site(name):
-    tangent = tangent_of(name)
-    path = tangent.paths[0]
-    wrong = np.zeros(path.weight.shape)
-    wrong[:, 0, 0, 3] = np.linspace(-1, 1, len(wrong)) ** 3
-    column = tangent.new(path.free(path.rows(wrong[None])))[:, 0]
-    drifting = replace(tangent, residual=tangent.residual + 30 * column / np.linalg.norm(column))
-    found = screen(drifting, CATALOGUE, np.random.default_rng(0), 40)[0]
-    assert found.name == "readings of u at one site wrong by any course"
-    assert found.change.site == 3
+@pytest.mark.parametrize("name", ["sine-gordon", "dnls"])
+def test_a_travelling_wave_is_found_as_such_before_any_name(name):
+    found = screen(tangent_of(name, "other: plane-wave", 12.0), CATALOGUE, np.random.default_rng(0), 40)
+    evidence = {one.name: one.evidence for one in found}
+    named = max(one.evidence for one in found if one.named)
+    assert evidence["a wave of force along the chain"] > named + 5
+
+
+def test_a_term_that_changes_in_time_and_along_the_chain_is_a_sum_of_products():
+    path = tangent_of("phi4").paths[0]
+    u = path.fields()[0]
+    x, n = np.linspace(0, 1, len(u))[:, None], np.linspace(-1, 1, u.shape[1])
+    moving = np.exp(-((n - x) ** 2) / 2) * u
+    every = np.concatenate([unnamed._in_both(path), unnamed._in_time(path), unnamed._along(path), u[None, :, None]])
+    assert left_by(every, moving[:, None]) < FAITHFUL
 
 
 @pytest.mark.parametrize(

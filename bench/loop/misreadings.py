@@ -1,0 +1,178 @@
+"""Ways for an instrument to be wrong without a name, that compete with the catalogue's effects (motions without one: `bench.loop.unnamed`).
+
+- Readings that are wrong by any smooth function of the field: a scale that is bent, a range that ends.
+- Readings in which those of the neighbours are mixed.
+- One site's readings that come late, and ones that are wrong by any course in time.
+- Patterns in space and time of what is left: nets for whatever else there is.
+
+What is wrong with u may be wrong with v in its own way, or not at all: both are tried.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.loop.model import Change, rates
+from bench.loop.tangent import Path, Tangent
+from bench.loop.unnamed import Group, at_each, course, group, modes_of, polynomials, share
+from bench.loop.ways import Try, attempt
+from systems.effects import Effect
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jaxtyping import Float
+    from numpy import ndarray
+
+# Of the field's own size: a step for derivatives of a function of it.
+STEP = 1e-4
+BANDS = ((0, 4), (4, 12))
+CHANGE = Change(Effect("unnamed", "0"))
+
+
+def misreadings(tangent: Tangent) -> list[Group]:
+    """List all of them by what they are called in a ranking."""
+    kinds = (_bent, _mixed, _late, _courses, _patterns)
+    return [found for kind in kinds for found in kind(tangent)]
+
+
+def _levels(tangent: Tangent) -> int:
+    """Count what is read: u, or u and v."""
+    return int(tangent.paths[0].weight.shape[1])
+
+
+def _rows(
+    path: Path, u: Float[ndarray, "columns time sites"], v: Float[ndarray, "columns time sites"] | None
+) -> ndarray:
+    """Write what u, and v where it is given, are wrong by as columns; complex ones once more, turned by i."""
+    levels = path.weight.shape[1]
+    wrong = np.stack([u, np.zeros_like(u) if v is None else v][:levels], axis=2)
+    if path.is_complex:
+        wrong = np.concatenate([wrong, 1j * wrong])
+        return path.rows(np.stack([wrong.real, wrong.imag], axis=3))
+    return path.rows(wrong[:, :, :, None])
+
+
+def _seen(path: Path) -> tuple[ndarray, ndarray | None]:
+    """Give u and v of every site at the sample times."""
+    u, v = path.fields()
+    return u[:: path.steps], None if v is None else v[:: path.steps]
+
+
+def _law(tangent: Tangent, wrong: Callable[[Path, ndarray], ndarray], *, random: bool) -> list[Try | None]:
+    """Try readings that are wrong by functions of the field at the same time: of u alone, or of both as v is the slope of u."""
+
+    def columns(_number: int, path: Path, both: bool) -> ndarray:
+        u, v = _seen(path)
+        slopes = None
+        if both and v is not None:
+            step = STEP * float(np.max(np.abs(u))) / max(float(np.max(np.abs(v))), 1e-300)
+            slopes = (wrong(path, u + step * v) - wrong(path, u - step * v)) / (2 * step)
+        return _rows(path, wrong(path, u), slopes)
+
+    tries = []
+    for both in (False, True)[: _levels(tangent)]:
+        every = tangent.columns(lambda k, path, both=both: columns(k, path, both))  # type: ignore[misc]
+        tries.append(attempt(tangent, CHANGE, every, random=random))
+    return tries
+
+
+def _bent(tangent: Tangent) -> list[Group]:
+    """Give scales that are bent: of a complex field by its size, or of each of its parts."""
+
+    def by_part(path: Path, u: ndarray) -> ndarray:
+        now = _seen(path)[0]
+        if path.is_complex:
+            most = float(max(np.max(np.abs(now.real)), np.max(np.abs(now.imag))))
+            real, imaginary = (polynomials(part + most, np.ones(part.shape), 2 * most) for part in (u.real, u.imag))
+            return real + 1j * imaginary
+        return polynomials(u - np.min(now), np.ones_like(u), float(np.ptp(now)))
+
+    def by_size(path: Path, u: ndarray) -> ndarray:
+        return polynomials(np.abs(u), u, float(np.max(np.abs(_seen(path)[0]))))
+
+    laws = (by_part, by_size) if tangent.paths[0].is_complex else (by_part,)
+    tries = [one for law in laws for one in _law(tangent, law, random=True)]
+    return group("readings wrong by a function of the field", tries)
+
+
+def _mixed(tangent: Tangent) -> list[Group]:
+    sites = tangent.paths[0].record.stretches.dynamics.sites
+    if sites < 2:
+        return []
+
+    def wrong(_path: Path, u: ndarray) -> ndarray:
+        return np.stack([u @ np.eye(sites, k=1), u @ np.eye(sites, k=-1)])
+
+    return group("readings mixed with the neighbours'", _law(tangent, wrong, random=False))
+
+
+def _late(tangent: Tangent) -> list[Group]:
+    """Give one site's readings as they would be a little earlier or later."""
+    dynamics, state = tangent.paths[0].record.stretches.dynamics, tangent.fitted.solution.state
+    if dynamics.sites < 2:
+        return []
+
+    def columns(number: int, path: Path, both: bool) -> ndarray:
+        rate = rates(path.record, state, number)[:, : path.weight.shape[1]]
+        if not both:
+            rate[:, 1:] = 0.0
+        return path.rows(np.stack([rate * one for one in np.eye(dynamics.sites)]))
+
+    tries = []
+    for both in (False, True)[: _levels(tangent)]:
+        every = tangent.columns(lambda k, path, both=both: columns(k, path, both))  # type: ignore[misc]
+        tries += [
+            attempt(tangent, Change(CHANGE.effect, site=site), every[:, [site]]) for site in range(dynamics.sites)
+        ]
+    return group("one site's readings late", tries)
+
+
+def _courses(tangent: Tangent) -> list[Group]:
+    """Give readings of one site that are wrong by any course in time."""
+    dynamics, waves = tangent.paths[0].record.stretches.dynamics, course(tangent)
+    if not waves:
+        return []
+    sites, parts = dynamics.sites, dynamics.parts
+
+    def columns(_number: int, path: Path, level: int) -> ndarray:
+        curves = np.cos(np.pi * np.arange(waves)[:, None] * share(path.record.times))
+        wrong = np.zeros((sites, waves, parts, *path.weight.shape))
+        for site in range(sites):
+            for part in range(parts):
+                wrong[site, :, part, :, level, part, site] = curves
+        return path.rows(wrong.reshape(-1, *path.weight.shape))
+
+    groups: list[Group] = []
+    for level in range(_levels(tangent)):
+        every = tangent.columns(lambda k, path, level=level: columns(k, path, level))  # type: ignore[misc]
+        name = f"readings of {'uv'[level]} at one site wrong by any course"
+        groups += group(name, at_each(tangent, every, range(sites), waves))
+    return groups
+
+
+def _patterns(tangent: Tangent) -> list[Group]:
+    """Give smooth patterns of what is left."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+
+    def columns(_number: int, path: Path, level: int, low: int, high: int) -> ndarray:
+        rows = len(path.record.times)
+        x = (np.arange(rows) + 0.5) / rows
+        found = []
+        for k in range(low, high):
+            for mode in modes_of(dynamics.sites):
+                for part in range(dynamics.parts):
+                    wrong = np.zeros(path.weight.shape)
+                    wrong[:, level, part] = np.cos(np.pi * k * x)[:, None] * mode
+                    found.append(wrong)
+        return path.rows(np.stack(found))
+
+    groups: list[Group] = []
+    for level in range(_levels(tangent)):
+        for low, high in BANDS:
+            every = tangent.columns(lambda k, path, c=level, a=low, b=high: columns(k, path, c, a, b))  # type: ignore[misc]
+            name = f"a pattern in {'uv'[level]}, {low}-{high - 1} half waves in time"
+            groups += group(name, [attempt(tangent, CHANGE, every)])
+    return groups

@@ -1,0 +1,80 @@
+"""What an instrument may do without a name: each is found as what it is, and goes with the velocities as it should."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import systems
+from bench.loop import misreadings
+from bench.loop.model import Model, first_fit
+from bench.loop.specimen import make
+from bench.loop.tangent import linearise
+from bench.loop.trace import screen
+from systems.effects import CATALOGUE
+
+
+@functools.cache
+def tangent_of(name):
+    system = systems.find(name)
+    one = make(system, "none", 0.0, np.random.default_rng(4), sites=9, samples=30, span=6.0, variation=True)
+    data = [replace(one.samples.observed(), ends=system.ends)]
+    return linearise(first_fit(Model(system.library("equation"), system.order), data))
+
+
+def clipped(u, _rate):
+    limit = 0.8 * np.max(np.abs(u))
+    return np.clip(u, -limit, limit) - u, 0 * u
+
+
+def mixed(u, rate):
+    beside = np.eye(u.shape[-1], k=1) + 0.5 * np.eye(u.shape[-1], k=-1)
+    return u @ beside, rate @ beside
+
+
+def late(u, rate):
+    return rate * np.eye(u.shape[-1])[3], 0 * u
+
+
+def drifting(u, _rate):
+    course = np.linspace(-1, 1, len(u))[:, None, None] ** 3
+    return course * np.eye(u.shape[-1])[3] * np.ones_like(u), 0 * u
+
+
+@pytest.mark.parametrize("name", ["phi4", "ginzburg-landau"])
+@pytest.mark.parametrize(
+    ("fault", "found", "site"),
+    [
+        (clipped, "readings wrong by a function of the field", None),
+        (mixed, "readings mixed with the neighbours'", None),
+        (late, "one site's readings late", 3),
+        (drifting, "readings of u at one site wrong by any course", 3),
+    ],
+)
+def test_a_fault_of_an_instrument_is_found_as_what_it_is(name, fault, found, site):
+    tangent = tangent_of(name)
+    path = tangent.paths[0]
+    field = path.field[:: path.steps]
+    rate = np.gradient(path.field[:, 0], path.times, axis=0)[:: path.steps]
+    wrong = np.stack(fault(field[:, 0], rate)[: path.weight.shape[1]], axis=1)
+    column = tangent.new(path.free(path.rows(wrong[None])))[:, 0]
+    faulty = replace(tangent, residual=tangent.residual + 30 * column / np.linalg.norm(column))
+    first = screen(faulty, CATALOGUE, np.random.default_rng(0), 40)[0]
+    assert first.name == found
+    assert first.change.site == site
+
+
+def test_velocities_are_the_slopes_of_what_the_field_is_read_as(monkeypatch):
+    """A reading of u**3 goes with one of 3 u**2 v."""
+    tangent = tangent_of("phi4")
+    caught = []
+    monkeypatch.setattr(misreadings, "attempt", lambda _tangent, _change, columns, **_: caught.append(columns))
+    misreadings._law(tangent, lambda _path, u: u[None] ** 3, random=False)
+    path = tangent.paths[0]
+    u, v = (one[:: path.steps] for one in path.fields())
+    for slopes, columns in zip((0 * v, 3 * u**2 * v), caught, strict=True):
+        expected = path.free(path.rows(np.stack([u**3, slopes], axis=1)[None, :, :, None]))
+        np.testing.assert_allclose(columns, expected, rtol=1e-5, atol=1e-6 * np.max(np.abs(expected)))
