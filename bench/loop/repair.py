@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from bench.loop.coherence import coherence
 from bench.loop.model import Change, Fitted, Model, carried, cut, first_fit, pace, refit, strengths, without
 from bench.loop.residual import (
     Forecast,
@@ -284,6 +285,7 @@ def close(
             findings = _steady(findings)
         named = [one for one in findings if one.named]
         if not left or len(fitted.model.changes) >= most:
+            left = left or _anything(fitted, draw, surrogates)
             rounds.append(Round(tuple(_unfitted(findings))))
             break
         ranking = _contest(fitted, findings, watcher, 2 * EQUAL if horizon.follows(fitted) else FAR)
@@ -460,6 +462,12 @@ def significant(findings: Sequence[Finding]) -> tuple[Finding, ...]:
         group = [one for one in findings if one.named is named]
         found += [one for one in group if one.rarity > np.log(len(group)) - np.log(FALSE_ALARM / 2)]
     return tuple(sorted(found, key=lambda one: -one.rarity))
+
+
+def _anything(fitted: Fitted, draw: np.random.Generator, surrogates: int) -> tuple[Finding, ...]:
+    """Look for anything at all where nothing that has a form is significant."""
+    found = () if _exact(fitted) else (coherence(linearise(fitted), draw, surrogates),)
+    return tuple(one for one in found if one.p < FALSE_ALARM / 2)
 
 
 def _unfitted(findings: Sequence[Finding]) -> list[Candidate]:

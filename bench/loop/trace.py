@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 SEARCHED = ("omega", "at", "width", "delay", "s")
 CERTAIN = 60.0
+EULER = 0.5772
 # Numbers drawn at a time for surrogates.
 CHUNK = 4_000_000
 
@@ -143,7 +144,7 @@ def rank(
     chunk = max(1, min(surrogates, CHUNK // max(rows, 1)))
     done = 0
     while done < surrogates:
-        noise = _surrogates(tangent, draw, min(chunk, surrogates - done))
+        noise = surrogate_residuals(tangent, draw, min(chunk, surrogates - done))
         done += noise.shape[1]
         for kept, (_, best, _) in zip(values, _scores(groups, noise, np.sum(noise**2, axis=0), spare), strict=True):
             kept.append(np.max(best, axis=0))
@@ -152,7 +153,7 @@ def rank(
         chosen = int(np.argmax(best[:, 0]))
         # The largest of m exponential variables has the mean ln m + 0.577 (Euler's constant) for large m.
         mean = float(np.mean(np.concatenate(null)))
-        count = float(np.clip(np.exp(mean - 0.5772) if mean > 1.3 else mean, 1.0, 10.0 * len(tries) + 1))
+        count = float(np.clip(np.exp(mean - EULER) if mean > 1.3 else mean, 1.0, 10.0 * len(tries) + 1))
         change = _with_spread(tangent, tries[chosen])
         searched = len(set(change.psi) & set(SEARCHED))
         cost = max(np.log(count), searched * np.log(tangent.fitted.count) / 2)
@@ -168,7 +169,7 @@ def rank(
     return sorted(findings, key=lambda one: -one.evidence)
 
 
-def _surrogates(tangent: Tangent, draw: np.random.Generator, count: int) -> ndarray:
+def surrogate_residuals(tangent: Tangent, draw: np.random.Generator, count: int) -> ndarray:
     """Draw what refits leave of pure noise: (rows, count)."""
     noise = draw.normal(size=(len(tangent.residual), count))
     pieces, begin = [], 0

@@ -157,6 +157,8 @@ def _pulse(tangent: Tangent, effect: Effect) -> list[Try | None]:
 
 def _together(tangent: Tangent, changes: Sequence[Change]) -> list[Try | None]:
     """Try changes of equally many forces; their columns are computed in one go."""
+    if not changes:
+        return []
     dynamics = tangent.paths[0].record.stretches.dynamics
 
     def columns(number: int, path: Path) -> ndarray:

@@ -96,7 +96,7 @@ def test_on_noise_alone_an_effect_is_as_rare_as_its_p_says(name):
     draw = np.random.default_rng(11)
     found = {effect: [] for effect, _, _ in groups}
     for _ in range(DRAWS):
-        residual = trace._surrogates(tangent, draw, 1)[:, 0]
+        residual = trace.surrogate_residuals(tangent, draw, 1)[:, 0]
         for finding in rank(replace(tangent, residual=residual), groups, draw, 60):
             found[finding.name].append(finding.p)
     for effect, chances in found.items():
