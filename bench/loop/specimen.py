@@ -66,7 +66,9 @@ class Drawn:
     Attributes:
         about: single numbers: the `site` (0, ..., N-1), frequency `omega` and `phase` of a drive, middle `at` and `width` of a pulse,
             `delay`, power `s` of a long-range coupling, the `middle` of the record; for `BLIND`: `wave_number` of a travelling
-            force, `spot`, `speed` and `breadth` of a moving one, frequency `own` of a resonator, and `warming`, a sensor's time.
+            force, `spot`, `speed` and `breadth` of a moving one, frequency `own` of a resonator, and `warming`, a sensor's time; for
+            `SECOND_BLIND`: `wire_from` and `wire_to`, the sites at the ends of a wire, `grip`, the most that a slipping spring is bent,
+            `cooling`, the time in which heat goes, `reach` of a response, and `hum` and `hum_phase`, frequency and phase of the mains.
         n: place of each site, counted from the chain's middle (N,).
         far: long-range coupling of the sites (N, N).
         bond: one bond's force (N, N).
@@ -76,6 +78,8 @@ class Drawn:
         omegas, phases: of five waves at each site (5, N).
         late: how late each row is read, in units of the jitter (T,), or None.
         force: a measured input (T, N), or None.
+        near: how much each site feels of each (N, N).
+        pickup: how much hum each sensor's wires catch (N,).
     """
 
     about: Mapping[str, float]
@@ -89,6 +93,8 @@ class Drawn:
     phases: Float[ndarray, "waves sites"]
     late: Float[ndarray, " time"] | None
     force: Float[ndarray, "time sites"] | None
+    near: Float[ndarray, "sites sites"]
+    pickup: Float[ndarray, " sites"]
 
     @property
     def site(self) -> int:
@@ -150,6 +156,13 @@ class Moment:
         angle = about["wave_number"] * self.drawn.n - about["omega"] * self.t + about["phase"]
         return np.asarray(np.exp(1j * angle) if self.chain.is_complex else np.cos(angle))
 
+    def wire(self) -> ndarray:
+        """Give, at both ends of the wire, the difference to the field at its other end; 0 elsewhere."""
+        ends = [int(self.drawn.about["wire_from"]), int(self.drawn.about["wire_to"])]
+        pull = np.zeros_like(self.u)
+        pull[ends] = self.u[ends[::-1]] - self.u[ends]
+        return pull
+
 
 Fields = tuple["ndarray", "ndarray | None"]
 
@@ -205,6 +218,9 @@ PUSHES: dict[str, Callable[[Moment], ndarray]] = {
     "other: moving-spot": lambda m: m.spot() * m.u,
     "other: plane-wave": lambda m: m.travelling(),
     "other: phase-conjugation": lambda m: np.conj(m.u),
+    # Nothing of the catalogue, of the second blind set.
+    "other: stray-wire": lambda m: m.wire(),
+    "other: nonlocal-response": lambda m: (m.drawn.near @ np.abs(m.u) ** 2) * m.u,
 }
 
 # The second set from outside the catalogue, made by somebody who had not looked at the diagnosis: those that push or act through what
@@ -217,20 +233,37 @@ BLIND_READINGS = (
     "other: drifting-sensor", "other: neighbour-crosstalk", "other: slow-sensor", "other: clipped-reading",
 )  # fmt: skip
 BLIND = (*BLIND_MOTIONS, *BLIND_READINGS)
+# The third set, made in the same way by somebody else after the second had been used up.
+SECOND_MOTIONS = (
+    "other: stray-wire", "other: nonlocal-response", "other: slow-heating", "other: slipping-spring", "other: shared-inertia",
+)  # fmt: skip
+SECOND_READINGS = ("other: scanned-channels", "other: mains-hum", "other: slack-needle")
+SECOND_BLIND = (*SECOND_MOTIONS, *SECOND_READINGS)
 
-ONLY_SECOND = ("other: cubic-drag", "other: friction-between", "other: wavy-drag", "other: lopsided-bonds")
-ONLY_COMPLEX = ("other: phase-conjugation",)
+ONLY_SECOND = (
+    "other: cubic-drag", "other: friction-between", "other: wavy-drag", "other: lopsided-bonds", "other: slipping-spring",
+)  # fmt: skip
+ONLY_COMPLEX = ("other: phase-conjugation", "other: nonlocal-response")
 READINGS = ("sensor-offset", "sensor-gain", "sensor-curve", "clock", "quantisation")
-OTHERS = (*(name for name in PUSHES if name.startswith("other: ") and name not in BLIND), *BLIND)
+OTHERS = (
+    *(name for name in PUSHES if name.startswith("other: ") and name not in (*BLIND, *SECOND_BLIND)),
+    *BLIND,
+    *SECOND_BLIND,
+)
 # Effects of complex fields whose size is a real number all the same.
-REAL = ("damping", "nonlinear-loss", "gain-loss", "disorder", "unequal-masses", "ends", *READINGS, *BLIND_READINGS)
+REAL = (
+    "damping", "nonlinear-loss", "gain-loss", "disorder", "unequal-masses", "ends", *READINGS, *BLIND_READINGS,
+    "other: shared-inertia", *SECOND_READINGS,
+)  # fmt: skip
 # Without a size of their own.
 FIXED = ("ends", "quantisation")
 # Steps to the amount of an effect that has the size: to first order, then with the declared equation fitted, to within CLOSE.
 FIRST_ORDER, REFITS, CLOSE = 6, 6, 0.1
-# Steps between two samples in which a slow sensor follows.
+# Steps between two samples in which a slow or a slack sensor follows.
 FINE = 40
-MADE = tuple(dict.fromkeys((NONE, *PUSHES, *READINGS, "ends", "unequal-masses", "known-input", "memory", *BLIND)))
+MADE = tuple(
+    dict.fromkeys((NONE, *PUSHES, *READINGS, "ends", "unequal-masses", "known-input", "memory", *BLIND, *SECOND_BLIND))
+)
 
 
 def sensible(name: str, system: System) -> bool:
@@ -443,7 +476,20 @@ def _drawn(name: str, sites: int, times: ndarray, draw: np.random.Generator) -> 
         "own": more.uniform(1.0, 4.0),
         "warming": span * more.uniform(0.1, 0.4),
     }
-    return Drawn(about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force)
+    about |= {
+        "wire_from": int(sites * more.uniform(0.2, 0.4)),
+        "wire_to": int(sites * more.uniform(0.6, 0.8)),
+        "grip": more.uniform(0.2, 0.8),
+        "cooling": span * more.uniform(0.1, 0.5),
+        "reach": more.uniform(1.0, 3.0),
+        "hum": more.uniform(3.0, 9.0),
+        "hum_phase": more.uniform(0, 2 * np.pi),
+    }
+    near = np.exp(-distance / about["reach"])
+    pickup = more.uniform(0.5, 1.5, size=sites)
+    return Drawn(
+        about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force, near, pickup
+    )
 
 
 def _run(
@@ -500,6 +546,20 @@ def _disturbed(name: str, amount: complex, chain: Motion, start: ndarray, times:
         return _with_memory(late, chain, start, times, float(drawn.about["delay"]))
     if name == "other: side-resonator":
         return _with_resonator(amount, chain, start, times, drawn.site, float(drawn.about["own"]))
+    if name == "other: slow-heating":
+        # What moves warms its site, which gives the heat off again; the force of a warm site is another.
+        cooling = float(drawn.about["cooling"])
+        return _with_hidden(
+            lambda heat, u: amount * heat * u, lambda heat, v: (np.abs(v) ** 2 - heat) / cooling, chain, start, times
+        )
+    if name == "other: slipping-spring":
+        # Each site drags a spring whose foot slips: its bend follows the site when small, and never passes the grip.
+        grip = float(drawn.about["grip"])
+        return _with_hidden(
+            lambda bend, _: -amount * bend, lambda bend, v: v - np.abs(v) * bend / grip, chain, start, times
+        )
+    if name == "other: shared-inertia":
+        return _run(chain, start, times, _heavy_bonds(chain, drawn, float(np.real(amount))))
     if name == "ends":
         return _run(replace(chain, ends=_other(chain.ends)), start, times, None)
     if name == "clock":
@@ -507,6 +567,10 @@ def _disturbed(name: str, amount: complex, chain: Motion, start: ndarray, times:
         return _read_late(chain, start, times, float(np.real(amount)) * drawn.late)
     if name == "other: slow-sensor":
         return _read_slowly(chain, start, times, float(np.real(amount)), drawn.site)
+    if name == "other: scanned-channels":
+        return _read_in_turn(chain, start, times, float(np.real(amount)))
+    if name == "other: slack-needle":
+        return _read_with_slack(chain, start, times, float(np.real(amount)))
     return _misread(name, float(np.real(amount)), drawn, times, *_run(chain, start, times, None))
 
 
@@ -517,14 +581,20 @@ def _other(ends: Ends) -> Ends:
 
 def _scaled(chain: Motion, site: int, amount: float) -> Callable[[float, ndarray, ndarray], ndarray]:
     """Make the push that scales one site's whole right-hand side by 1 + amount."""
-    rate, size = chain.right_hand_side, chain.parts * chain.sites
+    return lambda t, u, v: np.asarray(amount * np.eye(chain.sites)[site] * _whole(chain, t, u, v))
 
-    def push(t: float, u: ndarray, v: ndarray) -> ndarray:
-        own = rate(t, chain.pack(u, v))[-size:]
-        whole = own[: chain.sites] + 1j * own[chain.sites :] if chain.is_complex else own
-        return np.asarray(amount * np.eye(chain.sites)[site] * whole)
 
-    return push
+def _whole(chain: Motion, t: float, u: ndarray, v: ndarray) -> ndarray:
+    """Give the chain's own right-hand side."""
+    own = chain.right_hand_side(t, chain.pack(u, v))[-chain.parts * chain.sites :]
+    return np.asarray(own[: chain.sites] + 1j * own[chain.sites :] if chain.is_complex else own)
+
+
+def _heavy_bonds(chain: Motion, drawn: Drawn, amount: float) -> Callable[[float, ndarray, ndarray], ndarray]:
+    """Make the push by which u'' = F becomes u'' - amount (u''_{n+1} + u''_{n-1} - 2 u''_n) = F; with u' for order 1."""
+    between = np.stack([_between(Moment(0.0, one, one, chain, drawn)) for one in np.eye(chain.sites)], axis=1)
+    shared = np.linalg.inv(np.eye(chain.sites) - amount * between) - np.eye(chain.sites)
+    return lambda t, u, v: np.asarray(shared @ _whole(chain, t, u, v))
 
 
 def _misread(name: str, size: float, drawn: Drawn, times: ndarray, u: ndarray, v: ndarray | None) -> Fields:
@@ -552,6 +622,10 @@ def _misread(name: str, size: float, drawn: Drawn, times: ndarray, u: ndarray, v
         if np.iscomplexobj(u):
             return np.clip(u.real, -limit, limit) + 1j * np.clip(u.imag, -limit, limit), v
         return np.clip(u, -limit, limit), v
+    if name == "other: mains-hum":
+        # In step in all wires, of which some catch more. Velocities have wires of their own, which are screened.
+        hum = np.cos(drawn.about["hum"] * times + drawn.about["hum_phase"])
+        return u + size * hum[:, None] * drawn.pickup, v
     return u, v
 
 
@@ -569,7 +643,7 @@ def _read_slowly(chain: Motion, start: ndarray, times: ndarray, lag: float, site
 
     Between the steps of a fine grid the field is taken as straight, for which this is exact.
     """
-    grid = np.interp(np.arange(FINE * (len(times) - 1) + 1) / FINE, np.arange(len(times)), times)
+    grid = _fine(times)
     u, v = _run(chain, start, grid, None)
     seen, shown = u[:, site], u[:, site].copy()
     for k, step in enumerate(np.diff(grid)):
@@ -577,6 +651,35 @@ def _read_slowly(chain: Motion, start: ndarray, times: ndarray, lag: float, site
         shown[k + 1] = seen[k + 1] - behind + (shown[k] - seen[k] + behind) * np.exp(-step / lag)
     u[:, site] = shown
     return u[::FINE], None if v is None else v[::FINE]
+
+
+def _fine(times: ndarray) -> ndarray:
+    """Give the samples' times and FINE - 1 between each two."""
+    return np.asarray(np.interp(np.arange(FINE * (len(times) - 1) + 1) / FINE, np.arange(len(times)), times))
+
+
+def _read_in_turn(chain: Motion, start: ndarray, times: ndarray, sweep: float) -> Fields:
+    """Give the field as it is when one instrument reads the sites in turn, the last one `sweep` after the first; velocities likewise."""
+    sites = np.arange(chain.sites)
+    at = times[:, None] + sweep * sites / max(chain.sites - 1, 1)
+    grid, place = np.unique(at, return_inverse=True)
+    u, v = _run(chain, start, grid, None)
+    rows = place.reshape(at.shape)
+    return u[rows, sites], None if v is None else v[rows, sites]
+
+
+def _read_with_slack(chain: Motion, start: ndarray, times: ndarray, slack: float) -> Fields:
+    """Give the field as needles show it that stay where they are until it is `slack` away, and are then dragged along.
+
+    They start where the field is; each part of a complex field has its own. Velocities have sensors of their own, which are sound.
+    """
+    u, v = _run(chain, start, _fine(times), None)
+    parts = np.stack([u.real, u.imag]) if chain.is_complex else u[None]
+    shown = parts.copy()
+    for k in range(1, len(u)):
+        shown[:, k] = np.clip(shown[:, k - 1], parts[:, k] - slack, parts[:, k] + slack)
+    read = shown[0] + 1j * shown[1] if chain.is_complex else shown[0]
+    return read[::FINE], None if v is None else v[::FINE]
 
 
 def _with_resonator(amount: complex, chain: Motion, start: ndarray, times: ndarray, site: int, own: float) -> Fields:
@@ -600,6 +703,29 @@ def _with_resonator(amount: complex, chain: Motion, start: ndarray, times: ndarr
     u, v = chain.unpack(start)
     hidden = np.array([u[site], 0.0 if v is None else v[site]], complex).view(float)
     return chain.unpack(_integrated(coupled, np.concatenate([start, hidden]), times)[:-4])
+
+
+def _with_hidden(
+    push: Callable[[ndarray, ndarray], ndarray],
+    change: Callable[[ndarray, ndarray], ndarray],
+    chain: Motion,
+    start: ndarray,
+    times: ndarray,
+) -> Fields:
+    """Integrate with something unseen at each site, a number h that starts at 0.
+
+    The push is given h and u; the rate at which h changes follows from h and v (u for order 1).
+    """
+    rate, size, sites = chain.right_hand_side, chain.parts * chain.sites, chain.sites
+
+    def coupled(t: float, y: ndarray) -> ndarray:
+        rates, hidden = rate(t, y[:-sites]), y[-sites:]
+        u, v = chain.unpack(y[:-sites])
+        extra = push(hidden, u)
+        rates[-size:] += np.concatenate([extra.real, extra.imag]) if chain.is_complex else extra
+        return np.concatenate([rates, change(hidden, u if v is None else v)])
+
+    return chain.unpack(_integrated(coupled, np.concatenate([start, np.zeros(sites)]), times)[:-sites])
 
 
 def _always(field: ndarray, _: float) -> ndarray:

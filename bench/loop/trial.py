@@ -3,7 +3,7 @@
 A suite file (TOML) has a `title` and any number of tables
 
     [[made]]                       # every combination of the lists is a trial
-    effects = ["catalogue"]        # names; "catalogue": all that make sense; "outside", "blind": faults that are none of it; "none"; "a+b": two at once
+    effects = ["catalogue"]        # names; "catalogue": all that make sense; "outside", "blind", "second-blind": faults that are none of it; "none"; "a+b": two at once
     systems = ["phi4"]
     noise = [0.01]
     z = [5, 10, 30]
@@ -60,7 +60,9 @@ HERE = Path(__file__).parent / "suites"
 OFF_SIZE = 0.2
 OWN_SIZE = ("ends", "quantisation")
 KNOWN = tuple(effect.name for effect in CATALOGUE)
-GROUPS = {"catalogue": KNOWN, "outside": specimen.OTHERS, "blind": specimen.BLIND}
+GROUPS = {
+    "catalogue": KNOWN, "outside": specimen.OTHERS, "blind": specimen.BLIND, "second-blind": specimen.SECOND_BLIND,
+}  # fmt: skip
 
 
 class _Model(pydantic.BaseModel):

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 
 import systems
 from bench.loop.model import Model, first_fit
-from bench.loop.specimen import BLIND, FIXED, MADE, NONE, OTHERS, make, sensible
+from bench.loop.specimen import BLIND, FIXED, MADE, NONE, OTHERS, SECOND_BLIND, make, sensible
 from systems.effects import CATALOGUE
 from systems.errors import InputError
 from systems.lattice import library
@@ -33,6 +33,8 @@ SOME = [
     ("phi4", "sensor-curve"), ("phi4", "other: noise-force"), ("dnls", "disorder"), ("dnls", "unequal-masses"),
     ("dnls", "memory"), ("dnls", "quantisation"), ("dnls", "sensor-offset"), ("phi4", "other: moving-spot"),
     ("phi4", "other: slow-sensor"), ("dnls", "other: side-resonator"), ("dnls", "other: retarded-coupling"),
+    ("phi4", "other: slipping-spring"), ("dnls", "other: slow-heating"), ("dnls", "other: scanned-channels"),
+    ("phi4", "other: mains-hum"),
 ]  # fmt: skip
 
 
@@ -122,7 +124,7 @@ def truth_of(name):
     "effect",
     [
         "damping", "drive", "defect", "next-neighbour", "unequal-masses", "gradient", "other: lopsided-bonds", "other: moving-spot",
-        "other: plane-wave",
+        "other: plane-wave", "other: stray-wire",
     ],
 )  # fmt: skip
 def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
@@ -131,6 +133,8 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
     xi = truth_of("phi4")
     n = np.arange(7) - 3.0
     at = np.eye(7)[int(about["site"])]
+    left, right = int(about["wire_from"]), int(about["wire_to"])
+    assert right - left > 1
 
     def own(u):
         return xi[0] * (neighbours(u) - 2 * u) + xi[1] * u + xi[2] * u**3
@@ -152,6 +156,7 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
             * u
         ),
         "other: plane-wave": lambda t, _u, _v: np.cos(about["wave_number"] * n - about["omega"] * t + about["phase"]),
+        "other: stray-wire": lambda _t, u, _v: (u[right] - u[left]) * (np.eye(7)[left] - np.eye(7)[right]),
     }
 
     def rate(t, y):
@@ -165,18 +170,28 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
 
 
 @pytest.mark.parametrize(
-    ("effect", "turn"), [("nonlinear-loss", -1), ("asymmetric-coupling", 1), ("other: phase-conjugation", 1), ("other: plane-wave", 1)]
+    ("effect", "turn"),
+    [
+        ("nonlinear-loss", -1), ("asymmetric-coupling", 1), ("other: phase-conjugation", 1), ("other: plane-wave", 1),
+        ("other: stray-wire", 1), ("other: nonlocal-response", 1),
+    ],
 )  # fmt: skip
 def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
     one = drawn("dnls", effect, z=40, noise=0.05)
     coupling, cubic = truth_of("dnls")
     about = one.about
+    left, right = int(about["wire_from"]), int(about["wire_to"])
     extras = {
         "nonlinear-loss": lambda _, u: abs(u) ** 2 * u,
         "asymmetric-coupling": lambda _, u: (np.append(u[1:], u[-1]) - np.append(u[0], u[:-1])) / 2,
         "other: phase-conjugation": lambda _, u: u.real - 1j * u.imag,
         "other: plane-wave": lambda t, _: np.exp(
             1j * (about["wave_number"] * (np.arange(7) - 3.0) - about["omega"] * t + about["phase"])
+        ),
+        "other: stray-wire": lambda _, u: (u[right] - u[left]) * (np.eye(7)[left] - np.eye(7)[right]),
+        "other: nonlocal-response": lambda _, u: (
+            u
+            * np.array([sum(abs(u[m]) ** 2 * np.exp(-abs(m - n) / about["reach"]) for m in range(7)) for n in range(7)])
         ),
     }
 
@@ -245,6 +260,74 @@ def test_a_complex_resonator_turns_at_its_own_frequency():
     np.testing.assert_allclose(one.clean.u, y[:, :7], atol=1e-6)
 
 
+def test_what_moves_warms_its_site_and_a_warm_site_is_pulled():
+    one = drawn("phi4", "other: slow-heating", z=40, noise=0.05)
+    amount, cooling = np.real(one.amount), one.about["cooling"]
+    xi = truth_of("phi4")
+
+    def rate(_, y):
+        u, v, heat = np.split(y, 3)
+        force = xi[0] * (neighbours(u) - 2 * u) + xi[1] * u + xi[2] * u**3 + amount * heat * u
+        return np.concatenate([v, force, (v**2 - heat) / cooling])
+
+    t, u, v = one.clean.t, one.clean.u, one.clean.v
+    start = np.concatenate([u[0], v[0], np.zeros(7)])
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(u, y[:, :7], atol=1e-6)
+    np.testing.assert_allclose(v, y[:, 7:14], atol=1e-6)
+
+
+def test_light_warms_the_site_of_a_complex_field():
+    one = drawn("dnls", "other: slow-heating", z=40, noise=0.05)
+    cooling = one.about["cooling"]
+    coupling, cubic = truth_of("dnls")
+
+    def rate(_, y):
+        u, heat = np.split(y, 2)
+        change = 1j * coupling * (neighbours(u) - 2 * u) + 1j * cubic * abs(u) ** 2 * u + one.amount * heat * u
+        return np.concatenate([change, (abs(u) ** 2 - heat) / cooling])
+
+    t, start = one.clean.t, np.concatenate([one.clean.u[0], np.zeros(7)]).astype(complex)
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(one.clean.u, y[:, :7], atol=1e-6)
+
+
+def test_a_slipping_spring_forgets_by_the_way_gone_and_not_by_time():
+    one = drawn("phi4", "other: slipping-spring", z=40, noise=0.05, samples=400)
+    t, u, v = one.clean.t, one.clean.u, one.clean.v
+    amount, grip = np.real(one.amount), one.about["grip"]
+    xi = truth_of("phi4")
+    acceleration = (v[2:] - v[:-2]) / (t[2:] - t[:-2])[:, None]
+    own = np.array([xi[0] * (neighbours(row) - 2 * row) + xi[1] * row + xi[2] * row**3 for row in u])
+    bend = (own[1:-1] - acceleration) / amount
+    assert np.max(np.abs(bend)) < grip
+    # Steps of the field, each of them forgotten as exp(-way / grip) on the way that was gone since.
+    steps = np.diff(u, axis=0)
+    way = np.cumsum(np.abs(steps), axis=0)
+    for row in (100, 250, 390):
+        left = np.sum(steps[:row] * np.exp(-(way[row - 1] - way[:row]) / grip), axis=0)
+        np.testing.assert_allclose(bend[row - 1], left, atol=0.02 * np.max(np.abs(bend)))
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_bonds_that_share_inertia_feel_how_neighbours_accelerate(name):
+    one = drawn(name, "other: shared-inertia", z=40, noise=0.05, samples=400)
+    t, u = one.clean.t, one.clean.u
+    assert np.imag(one.amount) == 0
+    moved = u if name == "dnls" else one.clean.v
+    rate = CubicSpline(t, moved)(t, 1)
+    xi = truth_of(name)
+    if name == "dnls":
+        force = np.array([1j * xi[0] * (neighbours(row) - 2 * row) + 1j * xi[1] * abs(row) ** 2 * row for row in u])
+    else:
+        force = np.array([xi[0] * (neighbours(row) - 2 * row) + xi[1] * row + xi[2] * row**3 for row in u])
+    between = np.array([neighbours(row) - 2 * row for row in rate])
+    inside = slice(20, -20)
+    missing = (rate - force)[inside]
+    left = missing - np.real(one.amount) * between[inside]
+    assert np.max(np.abs(left)) < 0.01 * np.max(np.abs(missing))
+
+
 # Instruments that lie ------------------------------------------------------------------------------------------------------------
 
 
@@ -306,6 +389,50 @@ def test_a_clipped_reading_stays_within_its_range(name):
         np.testing.assert_allclose(part[~inside], np.sign(own[~inside]) * limit, rtol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_channels_are_read_one_after_the_other(name):
+    one, plain = drawn(name, "other: scanned-channels", z=40), drawn(name, NONE, samples=400)
+    sweep, t = np.real(one.amount), one.clean.t
+    assert sweep > 0
+    pairs = [(one.clean.u, plain.clean.u)] if name == "dnls" else [
+        (one.clean.u, plain.clean.u), (one.clean.v, plain.clean.v)
+    ]  # fmt: skip
+    for shown, true in pairs:
+        whole = CubicSpline(plain.clean.t, true)
+        for site in range(7):
+            late = t + sweep * site / 6
+            seen = late <= plain.clean.t[-1]
+            np.testing.assert_allclose(shown[seen, site], whole(late[seen])[:, site], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_the_mains_hum_in_step_in_all_wires(name):
+    shown, true, one = lied(name, "other: mains-hum", samples=100)
+    hum, t = shown - true, one.clean.t
+    assert np.max(np.abs(hum.imag)) == 0
+    wave = np.cos(one.about["hum"] * t + one.about["hum_phase"])
+    strengths = np.real(hum[0]) / wave[0] / np.real(one.amount)
+    assert np.all((strengths > 0.5) & (strengths < 1.5))
+    assert np.ptp(strengths) > 0.1
+    np.testing.assert_allclose(hum.real, np.real(one.amount) * np.outer(wave, strengths), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_slack_needle_stays_until_it_is_dragged(name):
+    shown, true, one = lied(name, "other: slack-needle", samples=400)
+    slack = np.real(one.amount)
+    pairs = [(shown, true)] if name == "phi4" else [(shown.real, true.real), (shown.imag, true.imag)]
+    for needle, field in pairs:
+        assert np.array_equal(needle[0], field[0])
+        assert np.max(np.abs(needle - field)) == pytest.approx(slack, rel=1e-4)
+        steps = np.diff(needle, axis=0)
+        moves = np.where(np.abs(steps) > 1e-6, np.sign(steps), 0)
+        assert 0.02 < np.mean(moves == 0) < 0.98
+        # In the midst of being dragged it is the full slack away, from behind.
+        dragged = (moves[1:] == moves[:-1]) & (moves[1:] != 0)
+        np.testing.assert_allclose((field - needle)[1:-1][dragged], slack * moves[1:][dragged], atol=1e-6)
+
+
 def test_making_one_does_not_call_the_dynamics_that_fits_use(monkeypatch):
     """But for the size, which is measured on the plain motion, everything is made without it."""
     from bench.loop import specimen
@@ -357,10 +484,17 @@ def test_what_the_equation_has_already_is_no_effect_of_it(name):
 
 
 def test_the_blind_set_is_outside_the_catalogue_and_beside_the_first():
-    assert len(OTHERS) == len(set(OTHERS)) == 12 + len(BLIND)
+    assert len(OTHERS) == len(set(OTHERS)) == 12 + len(BLIND) + len(SECOND_BLIND)
     assert set(BLIND) < set(OTHERS) <= set(MADE)
     assert not sensible("other: phase-conjugation", systems.find("phi4"))
     assert not sensible("other: lopsided-bonds", systems.find("dnls"))
+
+
+def test_the_second_blind_set_is_beside_the_first():
+    assert len(SECOND_BLIND) == len(set(SECOND_BLIND)) == 8
+    assert set(SECOND_BLIND) < set(OTHERS) - set(BLIND)
+    assert not sensible("other: nonlocal-response", systems.find("sine-gordon"))
+    assert not sensible("other: slipping-spring", systems.find("ginzburg-landau"))
 
 
 def test_every_effect_of_the_catalogue_can_be_made():

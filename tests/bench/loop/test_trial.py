@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from bench.loop import scores
+from bench.loop.specimen import SECOND_BLIND
 from bench.loop.trial import Made, Measured, _made, is_suite, load, names, run
 from systems.effects import CATALOGUE
 from systems.errors import InputError
@@ -87,6 +88,19 @@ def test_a_name_in_a_group_of_three_is_notis_right() -> None:
 def test_what_an_effect_of_the_catalogue_could_do_as_well_is_counted_apart() -> None:
     assert scores.kind("other: cubic-drag", 1.0) != scores.kind("other: cubic-drag", 9.0)
     assert scores.kind("damping", 0.0) == "one effect"
+
+
+def test_the_blind_sets_are_counted_apart() -> None:
+    kinds = [scores.kind(f"other: {name}", 9.0) for name in ("cubic-drag", "plane-wave", "mains-hum")]
+    assert [kind.split(", ")[1:-1] for kind in kinds] == [[], ["blind set"], ["second blind set"]]
+
+
+def test_a_suite_may_ask_for_one_blind_set(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('title = "x"\n[[made]]\neffects = ["second-blind"]\nsystems = ["phi4", "dnls"]\nz = [30]\n')
+    _, trials = load(str(path))
+    asked = {trial.effect for trial in trials if isinstance(trial, Made)}
+    assert asked == set(SECOND_BLIND)
 
 
 @pytest.mark.parametrize("effect", ["drive", "sensor-gain", "ends", "unequal-masses"])
