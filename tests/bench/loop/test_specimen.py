@@ -511,3 +511,10 @@ def test_an_unknown_effect_is_refused_by_name():
 def test_an_effect_that_does_nothing_is_refused():
     with pytest.raises(InputError, match="of no size is visible"):
         drawn("phi4", "onsite-linear")
+
+
+def test_a_record_so_dense_that_its_residual_has_no_line_can_be_sized():
+    one = make(
+        systems.find("phi4"), "other: cubic-drag", 10.0, np.random.default_rng(1), sites=7, samples=800, span=4.0
+    )
+    assert one.apart >= 0
