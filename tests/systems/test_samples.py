@@ -349,7 +349,7 @@ def test_other_files_under_the_name_of_an_npz_are_refused(tmp_path):
         ({"t": [1.0, 0.0], "u1": [1.0, 2.0]}, ["row 2", "column t"]),
         ({"t": [0.0], "u1": [1.0]}, ["1 row"]),
     ],
-    ids=str,
+    ids=["a text", "lists", "structures", "twice", "dates", "no t", "all missing", "backwards", "one row"],
 )
 def test_a_bad_parquet_is_told_by_file_and_place(tmp_path, table, words):
     path = tmp_path / "bad.parquet"
