@@ -1,8 +1,8 @@
 """Ways for an instrument to be wrong without a name, that compete with the catalogue's effects (motions without one: `bench.loop.unnamed`).
 
-- Readings that are wrong by any smooth function of the field: a scale that is bent, a range that ends.
-- Readings in which those of the neighbours are mixed.
-- One site's readings that come late, and ones that are wrong by any course in time.
+- Readings that are wrong by any smooth function of the field: a scale that is bent, a range that ends; or by one of its rate: a needle that sticks.
+- Readings in which those of the neighbours are mixed, or the hum of something else.
+- Readings that come late, one site's or each by its own; one site's that are wrong by any course in time.
 - Patterns in space and time of what is left: nets for whatever else there is.
 
 What is wrong with u may be wrong with v in its own way, or not at all: both are tried.
@@ -17,7 +17,7 @@ import numpy as np
 from bench.loop.model import Change, rates
 from bench.loop.tangent import Path, Tangent
 from bench.loop.unnamed import Group, at_each, course, group, modes_of, polynomials, share
-from bench.loop.ways import Try, attempt
+from bench.loop.ways import Try, attempt, frequencies
 from systems.effects import Effect
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ CHANGE = Change(Effect("unnamed", "0"))
 
 def misreadings(tangent: Tangent) -> list[Group]:
     """List all of them by what they are called in a ranking."""
-    kinds = (_bent, _mixed, _late, _courses, _patterns)
+    kinds = (_bent, _sticky, _mixed, _hums, _late, _courses, _patterns)
     return [found for kind in kinds for found in kind(tangent)]
 
 
@@ -109,8 +109,45 @@ def _mixed(tangent: Tangent) -> list[Group]:
     return group("readings mixed with the neighbours'", _law(tangent, wrong, random=False))
 
 
+def _sticky(tangent: Tangent) -> list[Group]:
+    """Give readings of u wrong by a function of du/dt, of each part of a complex field alike; its sign first."""
+    state = tangent.fitted.solution.state
+
+    def columns(number: int, path: Path) -> ndarray:
+        rate = rates(path.record, state, number)[:, 0]
+        most = float(np.max(np.abs(rate)))
+        wrong = np.concatenate([np.sign(rate)[None], polynomials(rate + most, np.ones_like(rate), 2 * most)])
+        whole = np.zeros((len(wrong), *path.weight.shape))
+        whole[:, :, 0] = wrong
+        return path.rows(whole)
+
+    every = tangent.columns(columns)
+    tries = [attempt(tangent, CHANGE, every[:, :1]), attempt(tangent, CHANGE, every, random=True)]
+    return group("readings wrong by a function of the rate", tries)
+
+
+def _hums(tangent: Tangent) -> list[Group]:
+    """Give a harmonic that all readings of a kind have alike."""
+    omegas, levels = frequencies(tangent), _levels(tangent)
+    parts = tangent.paths[0].record.stretches.dynamics.parts
+
+    def columns(_number: int, path: Path, level: int) -> ndarray:
+        angle = omegas[:, None] * path.record.times
+        beats = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        wrong = np.zeros((len(omegas), 2, parts, *path.weight.shape))
+        for part in range(parts):
+            wrong[:, :, part, :, level, part] = beats[..., None]
+        return path.rows(wrong.reshape(-1, *path.weight.shape))
+
+    tries, each = [], 2 * parts
+    for level in range(levels):
+        every = tangent.columns(lambda k, path, level=level: columns(k, path, level))  # type: ignore[misc]
+        tries += [attempt(tangent, CHANGE, every[:, k : k + each]) for k in range(0, every.shape[1], each)]
+    return group("a hum in all readings", tries)
+
+
 def _late(tangent: Tangent) -> list[Group]:
-    """Give one site's readings as they would be a little earlier or later."""
+    """Give readings as they would be a little earlier or later, of one site or of each by its own."""
     dynamics, state = tangent.paths[0].record.stretches.dynamics, tangent.fitted.solution.state
     if dynamics.sites < 2:
         return []
@@ -121,13 +158,12 @@ def _late(tangent: Tangent) -> list[Group]:
             rate[:, 1:] = 0.0
         return path.rows(np.stack([rate * one for one in np.eye(dynamics.sites)]))
 
-    tries = []
+    one, each = [], []
     for both in (False, True)[: _levels(tangent)]:
         every = tangent.columns(lambda k, path, both=both: columns(k, path, both))  # type: ignore[misc]
-        tries += [
-            attempt(tangent, Change(CHANGE.effect, site=site), every[:, [site]]) for site in range(dynamics.sites)
-        ]
-    return group("one site's readings late", tries)
+        one += [attempt(tangent, Change(CHANGE.effect, site=site), every[:, [site]]) for site in range(dynamics.sites)]
+        each.append(attempt(tangent, CHANGE, every, random=True))
+    return [*group("one site's readings late", one), *group("readings late, each site's by its own", each)]
 
 
 def _courses(tangent: Tangent) -> list[Group]:

@@ -1,9 +1,10 @@
 """Ways for a motion without a name to be there, that compete with the catalogue's effects (readings without one: `bench.loop.misreadings`).
 
 - Single terms that physicists use and the catalogue lacks; they can be fitted in full.
-- Smooth functions of one variable, whatever their form: a force that depends on the field, on the velocity, on a spring's stretch; a declared term that changes
-  in time, along the chain, or in both. They are random effects of unknown variance (`bench.loop.trace`).
-- A declared term that is another from some moment on.
+- One bond, between neighbours or any two sites, that is another than declared.
+- Smooth functions of one variable, whatever their form: a force that depends on the field, on the velocity, on a spring's stretch or how fast it is stretched; a
+  declared term that changes in time, along the chain, or in both. They are random effects of unknown variance (`bench.loop.trace`).
+- A declared term that is another from some moment on, that comes late, or that acts on the neighbours.
 - A force of any course in time, at one site or at all of them, and one that travels as a wave.
 - Smooth forces in space and time: nets for whatever else there is.
 """
@@ -12,13 +13,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bench.loop.model import Change, Force
-from bench.loop.tangent import Path, Tangent, force_along
-from bench.loop.ways import Try, attempt, places, too_wide
+from bench.loop.tangent import Path, Tangent, force_along, forces
+from bench.loop.ways import Try, attempt, lags, places, too_wide
 from systems.effects import Effect
 from systems.terms import Term
 
@@ -54,7 +56,7 @@ Group = tuple[str, list[Try]]
 
 def unnamed(tangent: Tangent) -> list[Group]:
     """List all of them by what they are called in a ranking."""
-    kinds = (_terms, _bonds, _functions, _moments, _courses, _waves, _nets)
+    kinds = (_terms, _bonds, _wires, _functions, _moments, _lags, _beside, _courses, _waves, _nets)
     return [found for kind in kinds for found in kind(tangent)]
 
 
@@ -111,6 +113,36 @@ def _bonds(tangent: Tangent) -> list[Group]:
     ]
 
 
+def _wires(tangent: Tangent) -> list[Group]:
+    """Give bonds between any two sites that are no neighbours."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    moving, parts = np.array(places(tangent)), dynamics.parts
+    pairs = [(a, b) for a in range(len(moving)) for b in range(a + 2, len(moving))]
+    if len(pairs) < 2 or len(tangent.residual) * len(pairs) * parts > MOST_NUMBERS:
+        return []
+
+    def columns(_number: int, path: Path) -> ndarray:
+        field = path.field[:, 0][..., dynamics.moving]
+        found = []
+        for a in range(len(moving) - 2):
+            others = np.arange(a + 2, len(moving))
+            pull = np.zeros((len(others), len(path.times), dynamics.parts, len(moving)))
+            stretch = np.moveaxis(field[..., others] - field[..., [a]], -1, 0)
+            pull[..., a] = stretch
+            pull[np.arange(len(others)), ..., others] = -stretch
+            every = np.stack([pull, turned(pull)], axis=1).reshape(-1, *pull.shape[1:]) if path.is_complex else pull
+            found.append(path.answer(every))
+        return np.concatenate(found, axis=1)
+
+    every = tangent.columns(columns)
+    change = Change(Effect("unnamed", "0"))
+    tries = [
+        attempt(tangent, replace(change, site=int(moving[a])), every[:, k * parts : (k + 1) * parts])
+        for k, (a, _) in enumerate(pairs)
+    ]
+    return group("a bond between two distant sites", tries)
+
+
 def _functions(tangent: Tangent) -> list[Group]:
     """Give forces that are smooth functions of one variable, and declared terms that change in time."""
     dynamics = tangent.paths[0].record.stretches.dynamics
@@ -123,8 +155,9 @@ def _functions(tangent: Tangent) -> list[Group]:
     }
     if dynamics.order == 2:
         kinds["a force that depends on v"] = _of_velocity
+        kinds["a coupling that depends on how fast it is stretched"] = functools.partial(_of_stretch, field="v")
     if dynamics.sites < 2 or too_wide(Term("u[n+1]+u[n-1]"), dynamics):
-        del kinds["a coupling that depends on the stretch"]
+        kinds = {name: make for name, make in kinds.items() if not name.startswith("a coupling")}
     if len(places(tangent)) < 2:
         del kinds["terms that change along the chain"], kinds["terms that change in time and along the chain"]
     found: list[Group] = []
@@ -168,10 +201,10 @@ def _of_velocity(path: Path) -> ndarray:
     return _sources(path, polynomials(v - np.min(v), np.ones_like(v), float(np.ptp(v))))
 
 
-def _of_stretch(path: Path) -> ndarray:
-    """Give functions of each spring's stretch, odd as action and reaction are."""
+def _of_stretch(path: Path, field: str = "u") -> ndarray:
+    """Give functions of each spring's stretch, or with v of its rate, odd as action and reaction are."""
     dynamics = path.record.stretches.dynamics
-    first, second = path.sources([Term("u[n+1]-u[n]"), Term("u[n-1]-u[n]")])
+    first, second = path.sources([Term(f"{field}[n+1]-{field}[n]"), Term(f"{field}[n-1]-{field}[n]")])
     stretches = np.stack([first, second])
     size = np.linalg.norm(stretches, axis=2, keepdims=True)
     x = 2 * size / max(float(np.max(size)), 1e-300) - 1
@@ -245,14 +278,46 @@ def _moments(tangent: Tangent) -> list[Group]:
     begin, end = min(path.times[0] for path in tangent.paths), max(path.times[-1] for path in tangent.paths)
     moments = np.linspace(begin, end, MOMENTS + 2)[1:-1]
 
-    def columns(_number: int, path: Path) -> ndarray:
+    def later(path: Path) -> ndarray:
         each = _steady(path)
-        return path.answer(np.concatenate([each * (path.times > moment)[:, None, None] for moment in moments]))
+        return np.concatenate([each * (path.times > moment)[:, None, None] for moment in moments])
 
-    every = tangent.columns(columns)
-    change, parts = Change(Effect("unnamed", "0")), tangent.paths[0].record.stretches.dynamics.parts
-    tries = [attempt(tangent, change, every[:, k : k + parts]) for k in range(0, every.shape[1], parts)]
-    return group("a term that changes at one moment", tries)
+    return _in_turn(tangent, "a term that changes at one moment", later)
+
+
+def _in_turn(tangent: Tangent, name: str, make: Callable[[Path], ndarray]) -> list[Group]:
+    """Try forces one after the other, a complex one with what it is turned by i."""
+    every = tangent.columns(lambda _, path: path.answer(make(path)))
+    change, each = Change(Effect("unnamed", "0")), tangent.paths[0].record.stretches.dynamics.parts
+    return group(name, [attempt(tangent, change, every[:, k : k + each]) for k in range(0, every.shape[1], each)])
+
+
+def _lags(tangent: Tangent) -> list[Group]:
+    """Give each of those terms as it was some time before; before the record it is what it was at its beginning."""
+    delays = lags(tangent)
+
+    def late(path: Path) -> ndarray:
+        from scipy.interpolate import CubicSpline
+
+        curve = CubicSpline(path.times, _steady(path), axis=1)
+        return np.concatenate([curve(np.maximum(path.times - delay, path.times[0])) for delay in delays])
+
+    return _in_turn(tangent, "a term that comes late", late) if len(delays) else []
+
+
+def _beside(tangent: Tangent) -> list[Group]:
+    """Give each of those terms, and the whole right-hand side (inertia that is shared), as the neighbours have it."""
+    if len(places(tangent)) < 2:
+        return []
+    coefficients = tangent.fitted.solution.state.coefficients
+
+    def shared(path: Path) -> ndarray:
+        whole = np.tensordot(coefficients, forces(path), (0, 0))
+        every = np.concatenate([_steady(path), np.stack([whole, turned(whole)] if path.is_complex else [whole])])
+        count = every.shape[-1]
+        return np.asarray(every @ (np.eye(count, k=1) + np.eye(count, k=-1)))
+
+    return _in_turn(tangent, "a term that acts on the neighbours", shared)
 
 
 def course(tangent: Tangent) -> int:

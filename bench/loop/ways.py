@@ -175,13 +175,15 @@ def _late(tangent: Tangent, effect: Effect) -> list[Try | None]:
     if not texts:
         return []
     past = _histories(tangent)
+    return _together(tangent, [Change(effect, texts, {"delay": float(delay)}, past=past) for delay in lags(tangent)])
+
+
+def lags(tangent: Tangent) -> list[float]:
+    """Give the delays that a memory is searched at; none where the record is too short for any."""
     times = tangent.paths[0].record.times
     span, step = float(times[-1] - times[0]), float(np.median(np.diff(times)))
     shortest = max(1.5 * step, SHORTEST_DELAY / max(pace((path.times, path.field) for path in tangent.paths), 1e-300))
-    if shortest >= span / 3:
-        return []
-    delays = np.geomspace(shortest, span / 3, DELAYS)
-    return _together(tangent, [Change(effect, texts, {"delay": float(delay)}, past=past) for delay in delays])
+    return [] if shortest >= span / 3 else [float(delay) for delay in np.geomspace(shortest, span / 3, DELAYS)]
 
 
 def _histories(tangent: Tangent) -> tuple[Callable[[ndarray], ndarray], ...]:

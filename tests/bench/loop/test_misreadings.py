@@ -44,10 +44,26 @@ def drifting(u, _rate):
     return course * np.eye(u.shape[-1])[3] * np.ones_like(u), 0 * u
 
 
+def sticking(_u, rate):
+    return np.sign(rate), 0 * rate
+
+
+def humming(u, _rate):
+    wave = np.cos(2.3 * np.linspace(0, 6, len(u)) + 0.7)
+    return wave[:, None, None] * np.ones_like(u), 0 * u
+
+
+def scanned(u, rate):
+    return rate * np.arange(u.shape[-1]), 0 * u
+
+
 @pytest.mark.parametrize("name", ["phi4", "ginzburg-landau"])
 @pytest.mark.parametrize(
     ("fault", "found", "site"),
     [
+        (sticking, "readings wrong by a function of the rate", None),
+        (humming, "a hum in all readings", None),
+        (scanned, "readings late, each site's by its own", None),
         (clipped, "readings wrong by a function of the field", None),
         (mixed, "readings mixed with the neighbours'", None),
         (late, "one site's readings late", 3),

@@ -67,6 +67,14 @@ def test_springs_of_any_law_are_sums_of_the_polynomials():
     assert left_by(unnamed._of_stretch(path), (np.tanh(2 * right) + np.tanh(2 * left))[:, None]) < FAITHFUL
 
 
+def test_friction_in_springs_of_any_law_is_one_too():
+    path = tangent_of("phi4").paths[0]
+    v = path.fields()[1]
+    right = np.concatenate([v[:, 1:], v[:, -1:]], axis=1) - v
+    left = np.concatenate([v[:, :1], v[:, :-1]], axis=1) - v
+    assert left_by(unnamed._of_stretch(path, "v"), (np.tanh(2 * right) + np.tanh(2 * left))[:, None]) < FAITHFUL
+
+
 def test_a_stiffness_that_changes_in_time_is_a_sum_of_half_waves():
     path = tangent_of("sine-gordon").paths[0]
     u = path.fields()[0]
@@ -116,6 +124,23 @@ def test_a_term_that_changes_in_time_and_along_the_chain_is_a_sum_of_products():
     moving = np.exp(-((n - x) ** 2) / 2) * u
     every = np.concatenate([unnamed._in_both(path), unnamed._in_time(path), unnamed._along(path), u[None, :, None]])
     assert left_by(every, moving[:, None]) < FAITHFUL
+
+
+@pytest.mark.parametrize(
+    ("system", "effect", "name"),
+    [
+        ("sine-gordon", "other: stray-wire", "a bond between two distant sites"),
+        ("dnls", "other: stray-wire", "a bond between two distant sites"),
+        ("ginzburg-landau", "other: retarded-coupling", "a term that comes late"),
+        ("sine-gordon", "other: shared-inertia", "a term that acts on the neighbours"),
+    ],
+)
+def test_a_bond_or_term_in_an_unusual_place_comes_before_every_name(system, effect, name):
+    evidence = {
+        one.name: one.evidence
+        for one in screen(tangent_of(system, effect, 30.0), CATALOGUE, np.random.default_rng(0), 40)
+    }
+    assert evidence[name] > max(evidence[effect.name] for effect in CATALOGUE if effect.name in evidence)
 
 
 @pytest.mark.parametrize(
