@@ -68,7 +68,7 @@ class Drawn:
             `delay`, power `s` of a long-range coupling, the `middle` of the record; for `BLIND`: `wave_number` of a travelling
             force, `spot`, `speed` and `breadth` of a moving one, frequency `own` of a resonator, and `warming`, a sensor's time; for
             `SECOND_BLIND`: `wire_from` and `wire_to`, the sites at the ends of a wire, `grip`, the most that a slipping spring is bent,
-            `cooling`, the time in which heat goes, `reach` of a response, and `hum` and `hum_phase`, frequency and phase of the mains.
+            `cooling`, the time in which heat goes, `fading` length of a response, and `hum` and `hum_phase`, frequency and phase of the mains.
         n: place of each site, counted from the chain's middle (N,).
         far: long-range coupling of the sites (N, N).
         bond: one bond's force (N, N).
@@ -481,11 +481,11 @@ def _drawn(name: str, sites: int, times: ndarray, draw: np.random.Generator) -> 
         "wire_to": int(sites * more.uniform(0.6, 0.8)),
         "grip": more.uniform(0.2, 0.8),
         "cooling": span * more.uniform(0.1, 0.5),
-        "reach": more.uniform(1.0, 3.0),
+        "fading": more.uniform(1.0, 3.0),
         "hum": more.uniform(3.0, 9.0),
         "hum_phase": more.uniform(0, 2 * np.pi),
     }
-    near = np.exp(-distance / about["reach"])
+    near = np.exp(-distance / about["fading"])
     pickup = more.uniform(0.5, 1.5, size=sites)
     return Drawn(
         about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force, near, pickup

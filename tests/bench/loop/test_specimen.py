@@ -191,7 +191,9 @@ def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
         "other: stray-wire": lambda _, u: (u[right] - u[left]) * (np.eye(7)[left] - np.eye(7)[right]),
         "other: nonlocal-response": lambda _, u: (
             u
-            * np.array([sum(abs(u[m]) ** 2 * np.exp(-abs(m - n) / about["reach"]) for m in range(7)) for n in range(7)])
+            * np.array(
+                [sum(abs(u[m]) ** 2 * np.exp(-abs(m - n) / about["fading"]) for m in range(7)) for n in range(7)]
+            )
         ),
     }
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import systems
 from bench.loop import scores
-from bench.loop.specimen import SECOND_BLIND
+from bench.loop.specimen import SECOND_BLIND, make
 from bench.loop.trial import Made, Measured, _made, is_suite, load, names, run
 from systems.effects import CATALOGUE
 from systems.errors import InputError
@@ -108,3 +110,12 @@ def test_where_the_right_effect_is_named_forecasts_are_those_of_the_true_model(e
     row = _made(Made(system="phi4", effect=effect, z=30.0, sites=9, samples=30))
     assert row["named"] == [effect]
     assert row["forecast_after"] == pytest.approx(row["forecast_true"], rel=0.02)
+
+
+def test_the_true_model_of_a_long_range_coupling_reaches_as_far_as_the_way_it_was_found_in():
+    """What is drawn for other faults must not change an effect's own parameters."""
+    drawn = make(
+        systems.find("phi4"), "long-range", 10.0, np.random.default_rng(1), sites=9, samples=30, span=6.0
+    ).about
+    own = {"reach", "open", "scale", "step", "width", "at", "omega", "delay", "s"}
+    assert own & set(drawn) == {"at", "width", "omega", "delay", "s"}
