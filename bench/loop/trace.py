@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 SEARCHED = ("omega", "at", "width", "delay", "s")
 CERTAIN = 60.0
-EULER = 0.5772
 # Numbers drawn at a time for surrogates.
 CHUNK = 4_000_000
 
@@ -153,7 +152,7 @@ def rank(
         chosen = int(np.argmax(best[:, 0]))
         # The largest of m exponential variables has the mean ln m + 0.577 (Euler's constant) for large m.
         mean = float(np.mean(np.concatenate(null)))
-        count = float(np.clip(np.exp(mean - EULER) if mean > 1.3 else mean, 1.0, 10.0 * len(tries) + 1))
+        count = float(np.clip(np.exp(mean - 0.5772) if mean > 1.3 else mean, 1.0, 10.0 * len(tries) + 1))
         change = _with_spread(tangent, tries[chosen])
         searched = len(set(change.psi) & set(SEARCHED))
         cost = max(np.log(count), searched * np.log(tangent.fitted.count) / 2)

@@ -27,13 +27,13 @@ def tangent_of(name, missing=0.0):
 
 
 @pytest.mark.parametrize(("name", "missing"), [("phi4", 0.0), ("dnls", 0.1)])
-def test_its_p_is_uniform_for_noise(name, missing):
+def test_noise_is_called_rare_no_more_often_than_it_is(name, missing):
     tangent = tangent_of(name, missing)
     draws = surrogate_residuals(tangent, np.random.default_rng(1), 120).T
     p = [coherence(replace(tangent, residual=one), np.random.default_rng(2)).p for one in draws]
-    assert 0.35 < np.mean(p) < 0.65
-    assert np.mean(np.array(p) < 0.1) < 0.2
+    assert all(np.mean(np.array(p) < level) <= 1.5 * level + 0.01 for level in (0.02, 0.1, 0.3, 0.5))
     assert min(p) > 1e-4
+    assert np.mean(np.array(p) < 0.5) > 0.1
 
 
 @pytest.mark.parametrize(
