@@ -68,7 +68,8 @@ class Drawn:
             `delay`, power `s` of a long-range coupling, the `middle` of the record; for `BLIND`: `wave_number` of a travelling
             force, `spot`, `speed` and `breadth` of a moving one, frequency `own` of a resonator, and `warming`, a sensor's time; for
             `SECOND_BLIND`: `wire_from` and `wire_to`, the sites at the ends of a wire, `grip`, the most that a slipping spring is bent,
-            `cooling`, the time in which heat goes, `fading` length of a response, and `hum` and `hum_phase`, frequency and phase of the mains.
+            `cooling`, the time in which heat goes, `fading` length of a response, and `hum` and `hum_phase`, frequency and phase of the
+            mains; for `THIRD_BLIND`: `play`, how far a site goes before it meets a stop, and `sway`, frequency of a mount.
         n: place of each site, counted from the chain's middle (N,).
         far: long-range coupling of the sites (N, N).
         bond: one bond's force (N, N).
@@ -80,6 +81,8 @@ class Drawn:
         force: a measured input (T, N), or None.
         near: how much each site feels of each (N, N).
         pickup: how much hum each sensor's wires catch (N,).
+        supply: frequencies and phases of an unsteady supply (2, 5).
+        flicker: how much brighter than usual each row is lit (T,).
     """
 
     about: Mapping[str, float]
@@ -95,6 +98,8 @@ class Drawn:
     force: Float[ndarray, "time sites"] | None
     near: Float[ndarray, "sites sites"]
     pickup: Float[ndarray, " sites"]
+    supply: Float[ndarray, "two waves"]
+    flicker: Float[ndarray, " time"]
 
     @property
     def site(self) -> int:
@@ -163,6 +168,11 @@ class Moment:
         pull[ends] = self.u[ends[::-1]] - self.u[ends]
         return pull
 
+    def supply(self) -> float:
+        """Give how far the unsteady supply is from its mean."""
+        omegas, phases = self.drawn.supply
+        return float(np.sum(np.cos(omegas * self.t + phases)))
+
 
 Fields = tuple["ndarray", "ndarray | None"]
 
@@ -221,6 +231,12 @@ PUSHES: dict[str, Callable[[Moment], ndarray]] = {
     # Nothing of the catalogue, of the second blind set.
     "other: stray-wire": lambda m: m.wire(),
     "other: nonlocal-response": lambda m: (m.drawn.near @ np.abs(m.u) ** 2) * m.u,
+    # Nothing of the catalogue, of the third blind set.
+    "other: pumped-coupling": lambda m: m.wave() * (m.stretch(1) + m.stretch(-1)),
+    "other: shaken-end": lambda m: m.wave() * np.eye(len(m.u))[0],
+    "other: three-body": lambda m: m.neighbour(1) * np.conj(m.u) * m.neighbour(-1),
+    "other: unsteady-supply": lambda m: m.supply() * m.u,
+    "other: bent-damper": lambda m: -(np.abs(m.u) ** 2) * m.v,
 }
 
 # The second set from outside the catalogue, made by somebody who had not looked at the diagnosis: those that push or act through what
@@ -239,21 +255,30 @@ SECOND_MOTIONS = (
 )  # fmt: skip
 SECOND_READINGS = ("other: scanned-channels", "other: mains-hum", "other: slack-needle")
 SECOND_BLIND = (*SECOND_MOTIONS, *SECOND_READINGS)
+# The fourth set, likewise by somebody who knew of the diagnosis only what it is for.
+THIRD_MOTIONS = (
+    "other: pumped-coupling", "other: shaken-end", "other: three-body", "other: unsteady-supply", "other: bent-damper",
+    "other: end-stops", "other: swaying-mount",
+)  # fmt: skip
+THIRD_READINGS = ("other: flickering-lamp", "other: averaging-readout", "other: floating-ground")
+THIRD_BLIND = (*THIRD_MOTIONS, *THIRD_READINGS)
 
 ONLY_SECOND = (
     "other: cubic-drag", "other: friction-between", "other: wavy-drag", "other: lopsided-bonds", "other: slipping-spring",
+    "other: bent-damper",
 )  # fmt: skip
 ONLY_COMPLEX = ("other: phase-conjugation", "other: nonlocal-response")
 READINGS = ("sensor-offset", "sensor-gain", "sensor-curve", "clock", "quantisation")
 OTHERS = (
-    *(name for name in PUSHES if name.startswith("other: ") and name not in (*BLIND, *SECOND_BLIND)),
+    *(name for name in PUSHES if name.startswith("other: ") and name not in (*BLIND, *SECOND_BLIND, *THIRD_BLIND)),
     *BLIND,
     *SECOND_BLIND,
+    *THIRD_BLIND,
 )
 # Effects of complex fields whose size is a real number all the same.
 REAL = (
     "damping", "nonlinear-loss", "gain-loss", "disorder", "unequal-masses", "ends", *READINGS, *BLIND_READINGS,
-    "other: shared-inertia", *SECOND_READINGS,
+    "other: shared-inertia", *SECOND_READINGS, *THIRD_READINGS,
 )  # fmt: skip
 # Without a size of their own.
 FIXED = ("ends", "quantisation")
@@ -261,9 +286,13 @@ FIXED = ("ends", "quantisation")
 FIRST_ORDER, REFITS, CLOSE = 6, 6, 0.1
 # Steps between two samples in which a slow or a slack sensor follows.
 FINE = 40
+# Points that a mean over a time is taken from.
+AVERAGED = 8
 MADE = tuple(
-    dict.fromkeys((NONE, *PUSHES, *READINGS, "ends", "unequal-masses", "known-input", "memory", *BLIND, *SECOND_BLIND))
-)
+    dict.fromkeys((
+        NONE, *PUSHES, *READINGS, "ends", "unequal-masses", "known-input", "memory", *BLIND, *SECOND_BLIND, *THIRD_BLIND,
+    ))
+)  # fmt: skip
 
 
 def sensible(name: str, system: System) -> bool:
@@ -487,9 +516,13 @@ def _drawn(name: str, sites: int, times: ndarray, draw: np.random.Generator) -> 
     }
     near = np.exp(-distance / about["fading"])
     pickup = more.uniform(0.5, 1.5, size=sites)
+    about |= {"play": more.uniform(0.3, 0.7), "sway": more.uniform(1.0, 4.0)}
+    supply = np.stack([more.uniform(2 * np.pi / span, 6.0, size=5), more.uniform(0, 2 * np.pi, size=5)])
+    flicker = more.normal(size=len(times))
     return Drawn(
-        about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force, near, pickup
-    )
+        about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force, near, pickup,
+        supply, flicker,
+    )  # fmt: skip
 
 
 def _run(
@@ -545,7 +578,7 @@ def _disturbed(name: str, amount: complex, chain: Motion, start: ndarray, times:
 
         return _with_memory(late, chain, start, times, float(drawn.about["delay"]))
     if name == "other: side-resonator":
-        return _with_resonator(amount, chain, start, times, drawn.site, float(drawn.about["own"]))
+        return _with_resonator(amount, chain, start, times, np.eye(chain.sites)[drawn.site], float(drawn.about["own"]))
     if name == "other: slow-heating":
         # What moves warms its site, which gives the heat off again; the force of a warm site is another.
         cooling = float(drawn.about["cooling"])
@@ -558,6 +591,17 @@ def _disturbed(name: str, amount: complex, chain: Motion, start: ndarray, times:
         return _with_hidden(
             lambda bend, _: -amount * bend, lambda bend, v: v - np.abs(v) * bend / grip, chain, start, times
         )
+    if name == "other: end-stops":
+        # Padded stops were put round each site where it stood at the start.
+        begin, play = chain.unpack(start)[0], float(drawn.about["play"])
+
+        def stopped(_t: float, u: ndarray, _v: ndarray) -> ndarray:
+            moved = u - begin
+            return np.asarray(-amount * moved * (1 - play / np.maximum(np.abs(moved), play)))
+
+        return _run(chain, start, times, stopped)
+    if name == "other: swaying-mount":
+        return _with_resonator(amount, chain, start, times, np.ones(chain.sites), float(drawn.about["sway"]))
     if name == "other: shared-inertia":
         return _run(chain, start, times, _heavy_bonds(chain, drawn, float(np.real(amount))))
     if name == "ends":
@@ -571,6 +615,9 @@ def _disturbed(name: str, amount: complex, chain: Motion, start: ndarray, times:
         return _read_in_turn(chain, start, times, float(np.real(amount)))
     if name == "other: slack-needle":
         return _read_with_slack(chain, start, times, float(np.real(amount)))
+    if name == "other: averaging-readout":
+        # The root, as a mean over a time is off by its square but for a shift, which is as good as another start.
+        return _read_averaged(chain, start, times, float(np.sqrt(np.real(amount))))
     return _misread(name, float(np.real(amount)), drawn, times, *_run(chain, start, times, None))
 
 
@@ -626,7 +673,19 @@ def _misread(name: str, size: float, drawn: Drawn, times: ndarray, u: ndarray, v
         # In step in all wires, of which some catch more. Velocities have wires of their own, which are screened.
         hum = np.cos(drawn.about["hum"] * times + drawn.about["hum_phase"])
         return u + size * hum[:, None] * drawn.pickup, v
+    if name == "other: flickering-lamp":
+        # One lamp lights all sites. Velocities are found from the same light.
+        bright = (1 + size * drawn.flicker)[:, None]
+        return u * bright, None if v is None else v * bright
+    if name == "other: floating-ground":
+        # What all sensors are measured against is itself lifted by their mean. Velocities have the same ground.
+        return _grounded(u, size), None if v is None else _grounded(v, size)
     return u, v
+
+
+def _grounded(field: ndarray, size: float) -> ndarray:
+    """Give a field as it is measured against a ground that its mean lifts."""
+    return np.asarray(field - size * np.mean(field, axis=1, keepdims=True))
 
 
 def _read_late(chain: Motion, start: ndarray, times: ndarray, late: ndarray) -> Fields:
@@ -682,26 +741,38 @@ def _read_with_slack(chain: Motion, start: ndarray, times: ndarray, slack: float
     return read[::FINE], None if v is None else v[::FINE]
 
 
-def _with_resonator(amount: complex, chain: Motion, start: ndarray, times: ndarray, site: int, own: float) -> Fields:
-    """Integrate with something unseen hung on one site, which pulls it by amount (w - u).
+def _read_averaged(chain: Motion, start: ndarray, times: ndarray, over: float) -> Fields:
+    """Give the field's mean over a time that begins with each sample's; the velocity's likewise. Gauss's rule, good for smooth fields."""
+    nodes, weights = np.polynomial.legendre.leggauss(AVERAGED)
+    at = times[:, None] + over * (1 + nodes) / 2
+    grid, place = np.unique(np.concatenate([times[:1], at.ravel()]), return_inverse=True)
+    u, v = _run(chain, start, grid, None)
+    rows = place[1:].reshape(at.shape)
+    share = weights[:, None] / 2
+    return np.sum(share * u[rows], axis=1), None if v is None else np.sum(share * v[rows], axis=1)
 
-    Its own motion is w'' = own^2 (u - w), or w' = own (u - w), times i for a complex field; it starts as the site does.
+
+def _with_resonator(
+    amount: complex, chain: Motion, start: ndarray, times: ndarray, hung: ndarray, own: float
+) -> Fields:
+    """Integrate with something unseen hung on some sites (N,), 1 for each of them, which pulls all these by amount (w - m).
+
+    m is their mean. Its own motion is w'' = own^2 (m - w), or w' = own (m - w), times i for a complex field; it starts as they do.
     """
     rate, size = chain.right_hand_side, chain.parts * chain.sites
     turn = 1j if chain.is_complex else 1.0
+    share = hung / np.sum(hung)
 
     def coupled(t: float, y: ndarray) -> ndarray:
-        change, u = rate(t, y[:-4]), chain.unpack(y[:-4])[0][site]
+        change, mean = rate(t, y[:-4]), share @ chain.unpack(y[:-4])[0]
         w, speed = y[-4:].view(complex)
-        pull = amount * (w - u)
-        change[-size + site] += pull.real
-        if chain.is_complex:
-            change[-size + chain.sites + site] += pull.imag
-        hidden = [speed, own**2 * (u - w)] if chain.order == 2 else [turn * own * (u - w), 0.0]
+        pull = amount * (w - mean) * hung
+        change[-size:] += np.concatenate([pull.real, pull.imag]) if chain.is_complex else pull.real
+        hidden = [speed, own**2 * (mean - w)] if chain.order == 2 else [turn * own * (mean - w), 0.0]
         return np.concatenate([change, np.array(hidden, complex).view(float)])
 
     u, v = chain.unpack(start)
-    hidden = np.array([u[site], 0.0 if v is None else v[site]], complex).view(float)
+    hidden = np.array([share @ u, 0.0 if v is None else share @ v], complex).view(float)
     return chain.unpack(_integrated(coupled, np.concatenate([start, hidden]), times)[:-4])
 
 

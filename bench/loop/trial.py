@@ -3,7 +3,7 @@
 A suite file (TOML) has a `title` and any number of tables
 
     [[made]]                       # every combination of the lists is a trial
-    effects = ["catalogue"]        # names; "catalogue": all that make sense; "outside", "blind", "second-blind": faults that are none of it; "none"; "a+b": two at once
+    effects = ["catalogue"]        # names; "catalogue": all that make sense; "outside", "blind", "second-blind", "third-blind": faults that are none of it; "none"; "a+b": two at once
     systems = ["phi4"]
     noise = [0.01]
     z = [5, 10, 30]
@@ -62,6 +62,7 @@ OWN_SIZE = ("ends", "quantisation")
 KNOWN = tuple(effect.name for effect in CATALOGUE)
 GROUPS = {
     "catalogue": KNOWN, "outside": specimen.OTHERS, "blind": specimen.BLIND, "second-blind": specimen.SECOND_BLIND,
+    "third-blind": specimen.THIRD_BLIND,
 }  # fmt: skip
 
 
