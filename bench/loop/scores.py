@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from bench.loop.specimen import BLIND, NONE, OTHERS, SECOND_BLIND
+from bench.loop.faults import BLIND, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND
 from bench.loop.trial import is_right
 from bench.provenance import lines
 from bench.tables import format_number
@@ -72,8 +72,8 @@ def kind(effect: str, apart: float) -> str:
     if effect == NONE:
         return "nothing missing"
     if effect in OTHERS:
-        group = "blind set, " if effect in BLIND else "second blind set, " if effect in SECOND_BLIND else ""
-        outside = "outside the catalogue, " + group
+        sets = {"blind set, ": BLIND, "second blind set, ": SECOND_BLIND, "third blind set, ": THIRD_BLIND}
+        outside = "outside the catalogue, " + next((text for text, names in sets.items() if effect in names), "")
         return outside + (f"{APART:g} or more from it" if apart >= APART else f"less than {APART:g} from it")
     return "two at once" if "+" in effect else "one effect"
 

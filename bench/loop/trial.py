@@ -37,7 +37,7 @@ import pydantic
 from threadpoolctl import threadpool_limits
 
 import systems
-from bench.loop import specimen
+from bench.loop import faults, specimen
 from bench.loop.model import Change
 from bench.loop.repair import Diagnosis, diagnose, polish
 from bench.loop.residual import alike, forecast, pooled
@@ -58,11 +58,11 @@ if TYPE_CHECKING:
 HERE = Path(__file__).parent / "suites"
 # A recording whose effect could not be given its size (it is as good as invisible) is no trial.
 OFF_SIZE = 0.2
-OWN_SIZE = ("ends", "quantisation")
+OWN_SIZE = tuple(name for name, fault in faults.FAULTS.items() if not fault.sized)
 KNOWN = tuple(effect.name for effect in CATALOGUE)
 GROUPS = {
-    "catalogue": KNOWN, "outside": specimen.OTHERS, "blind": specimen.BLIND, "second-blind": specimen.SECOND_BLIND,
-    "third-blind": specimen.THIRD_BLIND,
+    "catalogue": KNOWN, "outside": tuple(faults.OTHERS), "blind": tuple(faults.BLIND), "second-blind": tuple(faults.SECOND_BLIND),
+    "third-blind": tuple(faults.THIRD_BLIND),
 }  # fmt: skip
 
 
@@ -147,14 +147,14 @@ def load(name: str) -> tuple[str, list[Trial]]:
 
 
 def _expand(grid: _Grid, where: str) -> Iterator[Made]:
-    known = [specimen.NONE, *KNOWN, *specimen.OTHERS]
+    known = [faults.NONE, *KNOWN, *faults.OTHERS]
     for system in grid.systems:
         found = systems.find(system)
         effects: list[str] = []
         for name in grid.effects:
             if name in GROUPS:
                 pool = GROUPS[name]
-                effects += [one for one in pool if specimen.sensible(one, found)]
+                effects += [one for one in pool if faults.sensible(one, found)]
                 continue
             for part in name.split("+"):
                 if part not in known:
@@ -172,7 +172,7 @@ def key(trial: Trial) -> str:
     root = Path(__file__).resolve().parents[2]
     source = hashlib.sha256()
     for folder in ("systems", "methods", "bench/loop"):
-        for path in sorted((root / folder).glob("*.py")):
+        for path in sorted((root / folder).rglob("*.py")):
             if path.name not in ("report.py", "trial.py"):
                 source.update(path.read_bytes())
     return hashlib.sha256(f"{trial.model_dump_json()}\n{source.hexdigest()}".encode()).hexdigest()[:32]
@@ -232,7 +232,7 @@ def _made(trial: Made) -> dict[str, Any]:
         system, trial.effect, trial.z, draw, sites=trial.sites, samples=trial.samples, noise=trial.noise,
         velocities=trial.velocities, variation=True,
     )  # fmt: skip
-    if trial.effect != specimen.NONE and trial.effect not in OWN_SIZE and abs(one.z / trial.z - 1) > OFF_SIZE:
+    if trial.effect != faults.NONE and trial.effect not in OWN_SIZE and abs(one.z / trial.z - 1) > OFF_SIZE:
         raise InputError(f"{trial.effect} could not be given the size {trial.z:g}: it came out as {one.z:.3g}")
     declared = system.library("equation")
     wall, cpu = time.perf_counter(), time.process_time()
@@ -243,7 +243,7 @@ def _made(trial: Made) -> dict[str, Any]:
     seconds, cpu = time.perf_counter() - wall, time.process_time() - cpu
     own = _forecast_of_truth(one, found) if trial.effect in KNOWN else None
     named = [change.effect.name for change in found.course.after.model.changes]
-    wanted = [] if trial.effect == specimen.NONE or trial.effect in specimen.OTHERS else trial.effect.split("+")
+    wanted = [] if trial.effect == faults.NONE or trial.effect in faults.OTHERS else trial.effect.split("+")
     alike = [list(names) for names in found.course.equal]
     return {
         "size": one.z, "apart": one.apart, "about": dict(one.about), "verdict": found.course.verdict, "named": named, "alike": alike,
@@ -282,7 +282,7 @@ def is_right(wanted: list[str], named: list[str], alike: list[list[str]], verdic
 
     Without an effect nothing may be named; one from outside the catalogue must be seen, and not be explained.
     """
-    if effect in specimen.OTHERS:
+    if effect in faults.OTHERS:
         return verdict in ("unexplained", "partly explained")
     if not wanted:
         return not named

@@ -39,7 +39,7 @@ from scipy.stats import binomtest
 
 import methods
 import systems
-from bench.loop import specimen, trace
+from bench.loop import faults, specimen, trace
 from bench.loop.model import Fitted, Model, first_fit
 from bench.loop.tangent import Path, Tangent, forces, linearise, orthonormal
 from bench.loop.trial import OFF_SIZE
@@ -193,8 +193,8 @@ def findings(tangent: Tangent) -> list[trace.Finding]:
 
 def effects(system: System) -> list[str]:
     """Name the effects of the catalogue that are forces which the declared equation lacks."""
-    known = [name for name in specimen.PUSHES if name not in specimen.OTHERS]
-    return [name for name in known if find(name) in CANDIDATES and specimen.sensible(name, system)]
+    known = [name for name in faults.PUSHES if name not in faults.OTHERS]
+    return [name for name in known if find(name) in CANDIDATES and faults.sensible(name, system)]
 
 
 def trial(name: str, system: System, effect: str, z: float, seed: int, samples: Samples) -> dict[str, object]:

@@ -11,8 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import systems
+from bench.loop.faults import BLIND, FAULTS, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND, sensible
 from bench.loop.model import Model, first_fit
-from bench.loop.specimen import BLIND, FIXED, MADE, NONE, OTHERS, SECOND_BLIND, make, sensible
+from bench.loop.specimen import make
 from systems.effects import CATALOGUE
 from systems.errors import InputError
 from systems.lattice import library
@@ -23,7 +24,7 @@ NAMES = ["phi4", "sine-gordon", "dnls", "ginzburg-landau"]
 EVERY = [
     (name, effect)
     for name in ("phi4", "dnls")
-    for effect in MADE
+    for effect in FAULTS
     if effect != NONE and sensible(effect, systems.find(name))
 ]
 
@@ -50,7 +51,7 @@ def drawn(name, effect, z=15, **options):
 @pytest.mark.parametrize(("name", "effect"), EVERY)
 def test_an_effect_is_as_visible_as_was_asked_for(name, effect):
     one = drawn(name, effect)
-    if effect in FIXED:
+    if not FAULTS[effect].sized:
         assert one.z > 0
     else:
         assert one.z == pytest.approx(15, rel=0.1)
@@ -124,7 +125,8 @@ def truth_of(name):
     "effect",
     [
         "damping", "drive", "defect", "next-neighbour", "unequal-masses", "gradient", "other: lopsided-bonds", "other: moving-spot",
-        "other: plane-wave", "other: stray-wire",
+        "other: plane-wave", "other: stray-wire", "other: pumped-coupling", "other: shaken-end", "other: three-body",
+        "other: bent-damper", "other: end-stops",
     ],
 )  # fmt: skip
 def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
@@ -157,7 +159,16 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
         ),
         "other: plane-wave": lambda t, _u, _v: np.cos(about["wave_number"] * n - about["omega"] * t + about["phase"]),
         "other: stray-wire": lambda _t, u, _v: (u[right] - u[left]) * (np.eye(7)[left] - np.eye(7)[right]),
+        "other: pumped-coupling": lambda t, u, _v: wave(t) * (neighbours(u) - 2 * u),
+        "other: shaken-end": lambda t, _u, _v: wave(t) * (n == -3),
+        "other: three-body": lambda _t, u, _v: np.append(u[1:], u[-1]) * u * np.append(u[0], u[:-1]),
+        "other: bent-damper": lambda _t, u, v: -(u**2) * v,
+        "other: end-stops": lambda _t, u, _v: -(u - np.clip(u, begin - about["play"], begin + about["play"])),
     }
+    begin = one.clean.u[0]
+
+    def wave(t):
+        return np.cos(about["omega"] * t + about["phase"])
 
     def rate(t, y):
         u, v = np.split(y, 2)
@@ -173,7 +184,8 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
     ("effect", "turn"),
     [
         ("nonlinear-loss", -1), ("asymmetric-coupling", 1), ("other: phase-conjugation", 1), ("other: plane-wave", 1),
-        ("other: stray-wire", 1), ("other: nonlocal-response", 1),
+        ("other: stray-wire", 1), ("other: nonlocal-response", 1), ("other: pumped-coupling", 1), ("other: three-body", 1),
+        ("other: end-stops", -1),
     ],
 )  # fmt: skip
 def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
@@ -195,7 +207,13 @@ def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
                 [sum(abs(u[m]) ** 2 * np.exp(-abs(m - n) / about["fading"]) for m in range(7)) for n in range(7)]
             )
         ),
+        "other: pumped-coupling": lambda t, u: np.cos(about["omega"] * t + about["phase"]) * (neighbours(u) - 2 * u),
+        "other: three-body": lambda _, u: np.append(u[1:], u[-1]) * np.conj(u) * np.append(u[0], u[:-1]),
+        "other: end-stops": lambda _, u: (
+            np.exp(1j * np.angle(u - begin)) * np.maximum(abs(u - begin) - about["play"], 0)
+        ),
     }
+    begin = one.clean.u[0]
 
     def rate(t, u):
         beside = neighbours(u)
@@ -244,6 +262,38 @@ def test_a_resonator_that_is_not_seen_pulls_its_site():
     y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
     np.testing.assert_allclose(u, y[:, :7], atol=1e-6)
     np.testing.assert_allclose(v, y[:, 7:14], atol=1e-6)
+
+
+def test_a_mount_that_sways_pulls_all_sites_alike():
+    one = drawn("phi4", "other: swaying-mount", z=40, noise=0.05)
+    amount, own = np.real(one.amount), one.about["sway"]
+    xi = truth_of("phi4")
+
+    def rate(_, y):
+        u, v, (w, speed) = y[:7], y[7:14], y[14:]
+        mean = np.mean(u)
+        force = xi[0] * (neighbours(u) - 2 * u) + xi[1] * u + xi[2] * u**3 + amount * (w - mean)
+        return np.concatenate([v, force, [speed, own**2 * (mean - w)]])
+
+    t, u, v = one.clean.t, one.clean.u, one.clean.v
+    start = np.concatenate([u[0], v[0], [np.mean(u[0]), np.mean(v[0])]])
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(u, y[:, :7], atol=1e-6)
+    np.testing.assert_allclose(v, y[:, 7:14], atol=1e-6)
+
+
+def test_an_unsteady_supply_changes_the_linear_term_of_all_sites_alike():
+    one = drawn("phi4", "other: unsteady-supply", z=40, noise=0.05, samples=400)
+    t, u, v = one.clean.t, one.clean.u, one.clean.v
+    xi = truth_of("phi4")
+    own = np.array([xi[0] * (neighbours(row) - 2 * row) + xi[1] * row + xi[2] * row**3 for row in u])
+    inside = slice(20, -20)
+    missing = (CubicSpline(t, v)(t, 1) - own)[inside]
+    supply = np.sum(missing * u[inside], axis=1) / np.sum(u[inside] ** 2, axis=1)
+    assert np.max(np.abs(missing - supply[:, None] * u[inside])) < 0.01 * np.max(np.abs(missing))
+    # Five waves around nothing.
+    assert np.max(np.abs(supply)) < 5 * abs(np.real(one.amount))
+    assert np.min(supply) < 0 < np.max(supply)
 
 
 def test_a_complex_resonator_turns_at_its_own_frequency():
@@ -333,10 +383,18 @@ def test_bonds_that_share_inertia_feel_how_neighbours_accelerate(name):
 # Instruments that lie ------------------------------------------------------------------------------------------------------------
 
 
+LIE_ABOUT_BOTH = (
+    "other: neighbour-crosstalk",
+    "other: flickering-lamp",
+    "other: averaging-readout",
+    "other: floating-ground",
+)
+
+
 def lied(name, effect, **options):
-    """What is read, what there was, and what is said of it; velocities are read as they are but for crosstalk."""
+    """What is read, what there was, and what is said of it; velocities are read as they are but for what lies about them, too."""
     one, plain = drawn(name, effect, z=40, **options), drawn(name, NONE, **options)
-    if plain.clean.v is not None and effect != "other: neighbour-crosstalk":
+    if plain.clean.v is not None and effect not in LIE_ABOUT_BOTH:
         assert np.array_equal(one.clean.v, plain.clean.v)
     assert np.imag(one.amount) == 0
     return one.clean.u, plain.clean.u, one
@@ -435,6 +493,36 @@ def test_a_slack_needle_stays_until_it_is_dragged(name):
         np.testing.assert_allclose((field - needle)[1:-1][dragged], slack * moves[1:][dragged], atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_flickering_lamp_lights_all_sites_alike(name):
+    shown, true, one = lied(name, "other: flickering-lamp")
+    bright = np.sum(shown * np.conj(true), axis=1) / np.sum(np.abs(true) ** 2, axis=1)
+    np.testing.assert_allclose(shown, bright[:, None] * true, atol=1e-12)
+    assert np.max(np.abs(np.imag(bright))) < 1e-12
+    assert np.std(np.real(bright)) == pytest.approx(np.real(one.amount), rel=0.5)
+    if name == "phi4":
+        np.testing.assert_allclose(one.clean.v, np.real(bright)[:, None] * drawn(name, NONE).clean.v, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_an_averaging_readout_gives_means_over_the_time_after_each_sample(name):
+    shown, _, one = lied(name, "other: averaging-readout")
+    plain = drawn(name, NONE, samples=800)
+    field, over = CubicSpline(plain.clean.t, plain.clean.u), np.sqrt(np.real(one.amount))
+    for k in (0, 7, 14):
+        t = one.clean.t[k]
+        assert t + over < plain.clean.t[-1]
+        mean = np.asarray(field.integrate(t, t + over)) / over
+        np.testing.assert_allclose(shown[k], mean, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_floating_ground_is_lifted_by_the_mean_of_all_sites(name):
+    shown, true, one = lied(name, "other: floating-ground")
+    lifted = np.repeat(np.sum(true, axis=1)[:, None] / 7, 7, axis=1)
+    np.testing.assert_allclose(true - shown, np.real(one.amount) * lifted, atol=1e-12)
+
+
 def test_making_one_does_not_call_the_dynamics_that_fits_use(monkeypatch):
     """But for the size, which is measured on the plain motion, everything is made without it."""
     from bench.loop import specimen
@@ -485,22 +573,22 @@ def test_what_the_equation_has_already_is_no_effect_of_it(name):
     assert {other for other in OTHERS if sensible(other, system)} >= {"other: weak-bond", "other: saturation"}
 
 
-def test_the_blind_set_is_outside_the_catalogue_and_beside_the_first():
-    assert len(OTHERS) == len(set(OTHERS)) == 12 + len(BLIND) + len(SECOND_BLIND)
-    assert set(BLIND) < set(OTHERS) <= set(MADE)
+def test_the_blind_sets_are_outside_the_catalogue_and_beside_each_other():
+    assert [len(BLIND), len(SECOND_BLIND), len(THIRD_BLIND)] == [10, 8, 10]
+    assert len(OTHERS) == 12 + 10 + 8 + 10
+    assert {*BLIND, *SECOND_BLIND, *THIRD_BLIND} < set(OTHERS)
+    assert not set(OTHERS) & {one.name for one in CATALOGUE}
+
+
+def test_a_fault_is_for_lattices_that_can_have_it():
     assert not sensible("other: phase-conjugation", systems.find("phi4"))
     assert not sensible("other: lopsided-bonds", systems.find("dnls"))
-
-
-def test_the_second_blind_set_is_beside_the_first():
-    assert len(SECOND_BLIND) == len(set(SECOND_BLIND)) == 8
-    assert set(SECOND_BLIND) < set(OTHERS) - set(BLIND)
     assert not sensible("other: nonlocal-response", systems.find("sine-gordon"))
     assert not sensible("other: slipping-spring", systems.find("ginzburg-landau"))
 
 
 def test_every_effect_of_the_catalogue_can_be_made():
-    assert {one.name for one in CATALOGUE} <= set(MADE)
+    assert {one.name for one in CATALOGUE} <= set(FAULTS)
 
 
 def test_an_unknown_effect_is_refused_by_name():

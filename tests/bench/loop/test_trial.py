@@ -10,7 +10,8 @@ import pytest
 
 import systems
 from bench.loop import scores
-from bench.loop.specimen import SECOND_BLIND, make
+from bench.loop.faults import SECOND_BLIND
+from bench.loop.specimen import make
 from bench.loop.trial import Made, Measured, _made, is_suite, load, names, run
 from systems.effects import CATALOGUE
 from systems.errors import InputError

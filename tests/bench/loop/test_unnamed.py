@@ -10,9 +10,10 @@ import pytest
 
 import systems
 from bench.loop import unnamed
+from bench.loop.faults import OTHERS
 from bench.loop.model import Model, first_fit
 from bench.loop.repair import diagnose
-from bench.loop.specimen import OTHERS, make
+from bench.loop.specimen import make
 from bench.loop.tangent import linearise
 from bench.loop.trace import screen
 from systems.effects import CATALOGUE
