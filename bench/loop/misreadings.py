@@ -2,6 +2,7 @@
 
 - Readings that are wrong by any smooth function of the field: a scale that is bent, a range that ends; or by one of its rate: a needle that sticks.
 - Readings in which those of the neighbours are mixed, or the hum of something else.
+- Readings that are all scaled or lifted alike, by another amount at each time.
 - Readings that come late, one site's or each by its own; one site's that are wrong by any course in time.
 - Patterns in space and time of what is left: nets for whatever else there is.
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from bench.loop.model import Change, rates
 from bench.loop.tangent import Path, Tangent
-from bench.loop.unnamed import Group, at_each, course, group, modes_of, polynomials, share
+from bench.loop.unnamed import MOST_NUMBERS, Group, at_each, course, group, modes_of, polynomials, share
 from bench.loop.ways import Try, attempt, frequencies
 from systems.effects import Effect
 
@@ -34,7 +35,7 @@ CHANGE = Change(Effect("unnamed", "0"))
 
 def misreadings(tangent: Tangent) -> list[Group]:
     """List all of them by what they are called in a ranking."""
-    kinds = (_bent, _sticky, _mixed, _hums, _late, _courses, _patterns)
+    kinds = (_bent, _sticky, _mixed, _hums, _flickering, _late, _courses, _patterns)
     return [found for kind in kinds for found in kind(tangent)]
 
 
@@ -144,6 +145,24 @@ def _hums(tangent: Tangent) -> list[Group]:
         every = tangent.columns(lambda k, path, level=level: columns(k, path, level))  # type: ignore[misc]
         tries += [attempt(tangent, CHANGE, every[:, k : k + each]) for k in range(0, every.shape[1], each)]
     return group("a hum in all readings", tries)
+
+
+def _flickering(tangent: Tangent) -> list[Group]:
+    """Give readings of each time scaled or lifted by its own amount."""
+    dynamics, rows = tangent.paths[0].record.stretches.dynamics, len(tangent.paths[0].record.times)
+    if len(tangent.paths) > 1 or dynamics.sites < 2 or len(tangent.residual) * rows * dynamics.parts > MOST_NUMBERS:
+        return []
+
+    def scaled(path: Path, u: ndarray) -> ndarray:
+        return np.asarray(np.eye(len(path.record.times))[:, :, None] * u)
+
+    def lifted(path: Path, u: ndarray) -> ndarray:
+        return scaled(path, np.ones_like(u))
+
+    return [
+        *group("readings scaled at each time by its own", _law(tangent, scaled, random=True)),
+        *group("readings lifted at each time by its own", _law(tangent, lifted, random=True)[:1]),
+    ]
 
 
 def _late(tangent: Tangent) -> list[Group]:

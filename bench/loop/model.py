@@ -34,7 +34,7 @@ MIN_SITES = 9
 # Accuracy of the integration between samples, in units of the noise; friction that jumps would cost much more of it.
 ACCURACY = 0.1
 # Parameters that are found by the search and then kept.
-KEPT = ("s", "open", "reach", "step", "inner", "origin")
+KEPT = ("s", "open", "reach", "step", "inner", "origin", "whole")
 
 
 @functools.lru_cache(maxsize=512)
@@ -133,8 +133,10 @@ class Change:
             assert self.site is not None
             return [Force(read_term(text), np.eye(sites)[self.site], None, text) for text in self.texts]
         if acts == "every site":
-            # Deviations from their mean, which is the last site's too.
-            each = np.eye(sites)[:-1] - np.eye(sites)[-1]
+            each = np.eye(sites)
+            if not self.psi.get("whole"):
+                # Deviations from their mean, which the model has already: the last site's is what makes their sum 0.
+                each = each[:-1] - each[-1]
             return [
                 Force(read_term(text), row, None, f"{text} at site {k + 1}")
                 for text in self.texts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -57,6 +58,12 @@ MOST_EFFECTS = 4
 POLISH = 8
 # A residual of more than so many times the noise is gross: the model is then followed over shorter pieces.
 GROSS = 3.0
+# Over pieces on which a model is off by less than so many times more than on the shortest, it does not lose the readings any more than on those.
+LOST = 2.0
+# Names that leave the readings lost, and more than this share of what was beyond the noise, are none.
+HARDLY = 0.5
+# What cannot be told from an effect has at least this share of its evidence.
+COMPARABLE = 0.5
 MOST_PIECES = 64
 # Readings beyond twice the number of unknowns that a test of what is left needs.
 SPARE = 10
@@ -127,6 +134,11 @@ class Course:
     left: tuple[Finding, ...]
     verdict: str
     rival: tuple[str, float] | None = None
+
+    @property
+    def repeated(self) -> tuple[str, ...]:
+        """Effects with a frequency or time of their own that were added more than once: together they can stand for any course in time."""
+        return _repeated(self.after)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,15 +293,13 @@ def close(
         watcher(f"tracing what is left, round {len(rounds) + 1}")
         findings = screen(linearise(fitted), catalogue, draw, surrogates)
         left = () if _exact(fitted) else significant(findings)
-        if not horizon.follows(fitted):
-            findings = _steady(findings)
         named = [one for one in findings if one.named]
         if not left or len(fitted.model.changes) >= most:
             left = left or _anything(fitted, draw, surrogates)
             rounds.append(Round(tuple(_unfitted(findings))))
             break
-        ranking = _contest(fitted, findings, watcher, 2 * EQUAL if horizon.follows(fitted) else FAR)
-        best, margin = _chosen(ranking)
+        ranking = _contest(fitted, findings, watcher, lost=not horizon.follows(fitted))
+        best, margin = _chosen(ranking if horizon.follows(fitted) else _steady(ranking, horizon))
         count = len(named)
         if best is None or best.fitted is None or best.p * count > FALSE_ALARM:
             rounds.append(Round(tuple(ranking)))
@@ -303,13 +313,14 @@ def close(
             doubted = None
         elif found[1] > (BETTER if horizon.sees_all(fitted) else best.evidence):
             doubted = _Doubted(fitted, tuple(equal), len(rounds), best.evidence, best.evidence + found[1])
-        alike = tuple(
+        least = max(best.evidence - margin, COMPARABLE * best.evidence)
+        near = tuple(
             one.name for one in ranking
-            if one is not best and one.finding.named and one.fitted is not None and one.evidence > best.evidence - margin
+            if one is not best and one.finding.named and one.fitted is not None and one.evidence > least
         )  # fmt: skip
         rival = found if found[1] > EQUAL and horizon.sees_all(fitted) else None
-        rounds.append(Round(tuple(ranking), best.name, alike))
-        fitted, equal = best.fitted, [*equal, alike]
+        rounds.append(Round(tuple(ranking), best.name, near))
+        fitted, equal = best.fitted, [*equal, near]
         fitted, equal = _prune(fitted, equal)
         watcher("looking farther")
         fitted = settled(horizon.lengthen(fitted))
@@ -322,14 +333,29 @@ def close(
     fitted, equal = _prune(fitted, equal, all_of_them=True)
     if len(fitted.model.changes) > 1:
         fitted, equal, left = _reconsider(fitted, equal, left, horizon, catalogue, draw, surrogates, watcher)
+    if fitted.model.changes and not horizon.follows(fitted) and _hardly(before, fitted, horizon):
+        fitted, equal = before, []
+        rounds = [replace(rounds[0], added=None, equal=())]
+        left = significant([one.finding for one in rounds[0].ranking])
     if not fitted.model.changes:
         rival = None
     verdict = (
-        ("partly explained" if left or rival else "explained")
+        ("partly explained" if left or rival or _repeated(fitted) else "explained")
         if fitted.model.changes
         else ("unexplained" if left else "nothing missing")
     )
     return Course(before, fitted, tuple(equal), tuple(rounds), left, verdict, rival)
+
+
+def _hardly(before: Fitted, after: Fitted, horizon: Horizon) -> bool:
+    """Say whether what was added takes away only a small part of what is beyond the noise."""
+    shares = [over_noise(one, horizon.noise) ** 2 - 1 for one in (alike(before, after), after)]
+    return shares[1] > HARDLY * shares[0]
+
+
+def _repeated(fitted: Fitted) -> tuple[str, ...]:
+    timed = Counter(change.effect.name for change in fitted.model.changes if change.effect.acts in TIMED)
+    return tuple(name for name, count in timed.items() if count > 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,13 +412,23 @@ class Horizon:
         return self.follows(fitted) and max(len(samples.t) for samples in fitted.data) >= self.lengths[0]
 
     def first(self, model: Model, start: Float[ndarray, " terms"] | None = None) -> Fitted:
-        """Fit a model as far as it can follow; the shortest pieces where it never does."""
+        """Fit a model as far as it can follow.
+
+        Where it never does, to the longest pieces over which it is not much farther off than over the shortest: what a strong force does in
+        step with the time is seen best over long ones.
+        """
+        tried: list[Fitted] = []
         for length in self.lengths:
             last = length == self.lengths[-1]
-            fitted = first_fit(model, cut(self.data, length), steps=40 if last else 15, coefficients=start)
-            if self.follows(fitted):
-                break
-        return fitted
+            tried.append(first_fit(model, cut(self.data, length), steps=40 if last else 15, coefficients=start))
+            if self.follows(tried[-1]):
+                return tried[-1]
+        least = min(over_noise(one, self.noise) for one in tried if one.solution.converged or one is tried[-1])
+        return next(
+            one
+            for one in tried
+            if one is tried[-1] or (one.solution.converged and over_noise(one, self.noise) < LOST * least)
+        )
 
     def lengthen(self, fitted: Fitted) -> Fitted:
         """Fit a model to longer pieces as long as it follows them."""
@@ -440,13 +476,16 @@ def _told(samples: Samples, step: int) -> float:
     return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
 
 
-def _steady(findings: list[Finding]) -> list[Finding]:
-    """Leave out what acts at its own frequency or time, if anything else is significant.
+def _steady(ranking: Sequence[Candidate], horizon: Horizon) -> list[Candidate]:
+    """Leave out what acts at its own frequency or time and does not find the readings again, if anything else was tried.
 
-    Where the readings are lost, a force in step with the motion can stand for nearly anything.
+    Where the readings are lost, a force in step with the motion can stand for nearly anything; but not for all of it.
     """
-    steady = [one for one in findings if not one.named or one.change.effect.acts not in TIMED]
-    return steady if any(one.named for one in significant(steady)) else findings
+    kept = [
+        one for one in ranking
+        if one.finding.change.effect.acts not in TIMED or (one.fitted is not None and horizon.follows(one.fitted))
+    ]  # fmt: skip
+    return kept if any(one.finding.named and one.fitted is not None for one in kept) else list(ranking)
 
 
 def _exact(fitted: Fitted) -> bool:
@@ -475,16 +514,18 @@ def _unfitted(findings: Sequence[Finding]) -> list[Candidate]:
 
 
 def _contest(
-    fitted: Fitted, findings: Sequence[Finding], watcher: Watcher, window: float = 2 * EQUAL
+    fitted: Fitted, findings: Sequence[Finding], watcher: Watcher, *, window: float = 2 * EQUAL, lost: bool = False
 ) -> list[Candidate]:
-    """Fit the best few effects in full and rank all."""
+    """Fit the best few effects in full and rank all; more of them where the readings are lost, as the screen is rough there."""
     ranking: list[Candidate] = []
     screened, fits, others = 0.0, 0, 0
     for one in findings:
+        timed = one.change.effect.acts in TIMED
         # What is plainly visible is screened roughly; and other ends change the motion by more than to first order. What has a frequency or
         # a time of its own can stand for nearly anything, and is not given that much.
-        behind = window if one.change.effect.acts in TIMED else max(window, ROUGH * screened)
+        behind = window if timed else max(FAR if lost else window, ROUGH * screened)
         near = one.evidence > screened - behind or (one.change.ends is not None and one.evidence > EQUAL)
+        near = near or (timed and lost and one.evidence > EQUAL)
         # A term without a name is measured as the names are, where the screen puts it beside them.
         if not one.named:
             near = bool(one.change.texts) and one.evidence > OTHER_SHARE * screened and others < OTHER_FITS
@@ -717,7 +758,7 @@ def _reconsider(
             # Without it the readings are lost: its place is not in doubt.
             continue
         ranking = _contest(
-            smaller, screen(linearise(smaller), catalogue, draw, surrogates), watcher, max(2 * EQUAL, margin)
+            smaller, screen(linearise(smaller), catalogue, draw, surrogates), watcher, window=max(2 * EQUAL, margin)
         )
         tried = [one for one in ranking if one.finding.named and one.fitted is not None]
         if not tried:
@@ -731,7 +772,8 @@ def _reconsider(
             equal = [*equal[:number], *equal[number + 1 :], ()]
             return fitted, equal, significant(screen(linearise(fitted), catalogue, draw, surrogates))
         top = max(best.evidence, mine)
-        equal[number] = tuple(one.name for one in tried if one.name != own.effect.name and one.evidence > top - margin)
+        least = max(top - margin, COMPARABLE * top)
+        equal[number] = tuple(one.name for one in tried if one.name != own.effect.name and one.evidence > least)
     return fitted, equal, left
 
 

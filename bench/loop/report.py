@@ -416,6 +416,10 @@ def notes(diagnosis: Diagnosis) -> list[str]:
             one.name + ("" if one.change.site is None else f" (site {one.change.site + 1})") for one in unnamed[:3]
         )
         found.append(f"What would do most for what is left, though it is no effect of the catalogue: {listed}.")
+    found += [
+        f"{name} was added more than once: a few of them can stand for any course in time, so that the name is in doubt."
+        for name in course.repeated
+    ]
     if course.rival is not None:
         found.append(
             f"{course.rival[0]} would do better by {course.rival[1]:.1f} (natural logarithms of the likelihood ratio) in the place of the last "
@@ -570,10 +574,14 @@ def elsewhere(fitted: Fitted, digits: int = 4) -> list[str]:
             own = side(list(change.texts), [float(value) for value in values[block]], digits)
             said.append(f"site {change.site + 1} alone has {own} besides")
         elif acts == "every site":
-            said.append(
-                f"every site has {' and '.join(change.texts)} besides, with a coefficient of its own: "
-                f"mean {np.mean(values[block]):.3g}, standard deviation {np.std(values[block]):.3g}"
-            )
+            each = np.reshape(values[block], (len(change.texts), -1))
+            named = " and ".join(change.texts)
+            if change.psi.get("whole"):
+                about = f"mean {np.mean(each):.3g}, standard deviation {np.std(each):.3g}"
+            else:
+                each = np.concatenate([each, -np.sum(each, axis=1, keepdims=True)], axis=1)
+                about = f"deviations from their mean, which belongs to {named} itself; standard deviation {np.std(each):.3g}"
+            said.append(f"every site has {named} besides, with a coefficient of its own: {about}")
         elif acts == "one equation" and change.site is not None:
             factor = 1 + psi["scale"]
             said.append(

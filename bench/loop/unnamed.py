@@ -2,10 +2,10 @@
 
 - Single terms that physicists use and the catalogue lacks; they can be fitted in full.
 - One bond, between neighbours or any two sites, that is another than declared.
-- Smooth functions of one variable, whatever their form: a force that depends on the field, on the velocity, on a spring's stretch or how fast it is stretched; a
+- Smooth functions of one variable, whatever their form: a force that depends on the field, on how far it is from its mean, on the velocity, on a spring's stretch or how fast it is stretched; a
   declared term that changes in time, along the chain, or in both. They are random effects of unknown variance (`bench.loop.trace`).
-- A declared term that is another from some moment on, that comes late, or that acts on the neighbours.
-- A force of any course in time, at one site or at all of them, and one that travels as a wave.
+- A declared term that is another at one site or at each, from some moment on, that comes late, or that acts on the neighbours.
+- A force or a declared term of any course in time; a force at one site, of its own at each, or alike at all; one that travels as a wave.
 - Smooth forces in space and time: nets for whatever else there is.
 """
 
@@ -47,6 +47,8 @@ DEGREES, HALF_WAVES = 12, 6
 MODES = 6
 # Half waves of a course in time at one place; fewer where the columns of all sites would be more numbers than this.
 COURSE, MOST_NUMBERS = 12, 20_000_000
+# Half waves of what is alike at all sites.
+SUPPLY = 24
 MOMENTS = 16
 # Whole waves in the record and half waves along the chain of a travelling force, at most.
 WAVES, STANDING = 12, 24
@@ -56,7 +58,7 @@ Group = tuple[str, list[Try]]
 
 def unnamed(tangent: Tangent) -> list[Group]:
     """List all of them by what they are called in a ranking."""
-    kinds = (_terms, _bonds, _wires, _functions, _moments, _lags, _beside, _courses, _waves, _nets)
+    kinds = (_terms, _bonds, _wires, _functions, _uneven, _moments, _lags, _beside, _courses, _unsteady, _waves, _nets)
     return [found for kind in kinds for found in kind(tangent)]
 
 
@@ -148,6 +150,7 @@ def _functions(tangent: Tangent) -> list[Group]:
     dynamics = tangent.paths[0].record.stretches.dynamics
     kinds: dict[str, Callable[[Path], ndarray]] = {
         "a force that depends on u": _of_field,
+        "a force that depends on how far u is from its mean": _of_distance,
         "a coupling that depends on the stretch": _of_stretch,
         "terms that change in time": _in_time,
         "terms that change along the chain": _along,
@@ -195,6 +198,14 @@ def _of_field(path: Path) -> ndarray:
     return _sources(path, polynomials(u - np.min(u), np.ones_like(u), float(np.ptp(u))))
 
 
+def _of_distance(path: Path) -> ndarray:
+    u = path.fields()[0]
+    moved = u - np.mean(u, axis=0)
+    if path.is_complex:
+        return _sources(path, polynomials(np.abs(moved), moved, float(np.max(np.abs(moved)))))
+    return _sources(path, polynomials(moved - np.min(moved), np.ones_like(moved), float(np.ptp(moved))))
+
+
 def _of_velocity(path: Path) -> ndarray:
     v = path.fields()[1]
     assert v is not None
@@ -215,14 +226,19 @@ def _of_stretch(path: Path, field: str = "u") -> ndarray:
     return np.asarray(pulls)
 
 
-def _steady(path: Path) -> ndarray:
-    """Give each term of the model that does not know the time, and the field itself: (terms, fine, parts, M); complex ones and turned by i."""
+def _steady(path: Path, *, field: bool = True) -> ndarray:
+    """Give each term of the model that does not know the time, the velocity and, if wanted, the field itself: (terms, fine, parts, M).
+
+    Complex ones once more, turned by i.
+    """
     dynamics = path.record.stretches.dynamics
     own = [
         (term, weights) for term, weights in zip(dynamics.terms, _weights(path), strict=True) if "t" not in term.names
     ]
-    own.append((Term("u[n]"), np.ones(dynamics.count)))
+    own += [(Term(f"{name}[n]"), np.ones(dynamics.count)) for name in "uv"[: dynamics.order]]
     plain = [own[k] for k in _distinct(tuple(term.text for term, _ in own))]
+    if not field:
+        plain = [(term, weights) for term, weights in plain if term.text not in ("u[n]", "i*u[n]")]
     each = path.sources([term for term, _ in plain]) * np.stack([weights for _, weights in plain])[:, None, None]
     return np.concatenate([np.stack([one, turned(one)]) for one in each]) if path.is_complex else each
 
@@ -271,6 +287,35 @@ def _in_both(path: Path) -> ndarray:
 def share(t: ndarray) -> ndarray:
     """Give times as shares of a record."""
     return np.asarray((t - t[0]) / (t[-1] - t[0]))
+
+
+def _uneven(tangent: Tangent) -> list[Group]:
+    """Give each of those terms as it would be at one site, and of its own at each; with the field itself both have names."""
+    moving, dynamics = places(tangent), tangent.paths[0].record.stretches.dynamics
+    if len(moving) < 2 or len(tangent.residual) * len(moving) * len(dynamics.terms) > MOST_NUMBERS:
+        return []
+    each = dynamics.parts
+
+    def columns(_number: int, path: Path) -> ndarray:
+        terms = _steady(path, field=False)
+        sites = np.eye(dynamics.sites)[moving][:, dynamics.moving]
+        # Of each term all sites, and of each site the term and what it is turned by i.
+        kinds = terms.reshape(-1, 1, each, *terms.shape[1:]) * sites[:, None, None, None]
+        return path.answer(kinds.reshape(-1, *terms.shape[1:]))
+
+    every = tangent.columns(columns)
+    tries = [
+        attempt(
+            tangent, Change(Effect("unnamed", "0"), site=moving[k % len(moving)]), every[:, k * each : (k + 1) * each]
+        )
+        for k in range(every.shape[1] // each)
+    ]
+    apart = np.split(every, every.shape[1] // (each * len(moving)), axis=1)
+    change = Change(Effect("unnamed", "0"))
+    return [
+        *group("a term that is another at one site", tries),
+        *group("a term that is another at each site", [attempt(tangent, change, one, random=True) for one in apart]),
+    ]
 
 
 def _moments(tangent: Tangent) -> list[Group]:
@@ -358,6 +403,34 @@ def _courses(tangent: Tangent) -> list[Group]:
     return [
         *group("a force at one site, of any course", at_each(tangent, every, moving, waves)),
         *group("forces at all sites, of any course", [whole]),
+    ]
+
+
+def _unsteady(tangent: Tangent) -> list[Group]:
+    """Give a force alike at all sites, and each term of the model, of any course in time."""
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    waves = min(SUPPLY, min(len(path.record.times) for path in tangent.paths) // 2)
+    if waves < HALF_WAVES or len(tangent.residual) * waves * (len(dynamics.terms) + 3) * dynamics.parts > MOST_NUMBERS:
+        return []
+
+    def columns(_number: int, path: Path) -> ndarray:
+        alike = np.zeros((dynamics.parts, len(path.times), dynamics.parts, dynamics.count))
+        for part in range(dynamics.parts):
+            alike[part, :, part] = 1.0
+        courses = np.cos(np.pi * np.arange(waves)[:, None] * share(path.times))
+        kinds = np.concatenate([alike, _steady(path)])
+        kinds = kinds.reshape(-1, 1, dynamics.parts, *kinds.shape[1:]) * courses[:, None, :, None, None]
+        return path.answer(kinds.reshape(-1, *alike.shape[1:]))
+
+    every = tangent.columns(columns)
+    change = Change(Effect("unnamed", "0"))
+    force, *terms = (
+        attempt(tangent, change, one, random=True)
+        for one in np.split(every, every.shape[1] // (waves * dynamics.parts), axis=1)
+    )
+    return [
+        *group("a force alike at all sites, of any course", [force]),
+        *group("a term of any course in time", terms),
     ]
 
 

@@ -13,7 +13,7 @@ from bench.loop.model import Change, far_matrix, pace
 from bench.loop.tangent import Path, Tangent, force_along, forces, orthonormal
 from systems.effects import Effect
 from systems.lattice import Ends
-from systems.terms import Term
+from systems.terms import Term, express
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -109,10 +109,10 @@ def _everywhere(tangent: Tangent, effect: Effect) -> list[Try | None]:
 
 
 def frequencies(tangent: Tangent) -> ndarray:
-    """Give the angular frequencies that a drive is searched at."""
-    times = max((path.record.times for path in tangent.paths), key=len)
+    """Give the angular frequencies that a drive is searched at: of pieces of a record, those that the whole record tells apart."""
+    times = np.unique(np.concatenate([path.record.times for path in tangent.paths]))
     span = float(times[-1] - times[0])
-    highest = np.pi / float(np.median(np.diff(times)))
+    highest = np.pi / float(np.median([step for path in tangent.paths for step in np.diff(path.record.times)]))
     if len(times) <= LONG:
         # Less than a whole wave is no wave.
         count = int(min(MOST_FREQUENCIES, 2 * span * highest / np.pi))
@@ -258,7 +258,14 @@ def _disordered(tangent: Tangent, effect: Effect) -> list[Try | None]:
     texts = _texts(tangent, effect)
     if not texts or len(places(tangent)) < 3:
         return []
-    change = Change(effect, texts)
+    model, is_complex = tangent.fitted.model, tangent.paths[0].is_complex
+    present = [
+        *model.declared.terms,
+        *(Term(text) for one in model.changes if one.effect.acts == "everywhere" for text in one.texts),
+    ]
+    # Where the model has the term, or a part of it, its mean is known by another name.
+    whole = all(express(Term(text), present, is_complex) is None for text in texts)
+    change = Change(effect, texts, {"whole": True} if whole else {})
     columns = _forced(tangent, change)
     return [attempt(tangent, change, columns[:, np.linalg.norm(columns, axis=0) > 0], random=True)]
 
