@@ -5,7 +5,8 @@
 - Smooth functions of one variable, whatever their form: a force that depends on the field, on how far it is from its mean, on the velocity, on a spring's stretch or how fast it is stretched; a
   declared term that changes in time, along the chain, or in both. They are random effects of unknown variance (`bench.loop.trace`).
 - A declared term that is another at one site or at each, from some moment on, that comes late, or that acts on the neighbours.
-- A force or a declared term of any course in time; a force at one site, of its own at each, or alike at all; one that travels as a wave.
+- A force or a declared term of any course in time; a force at one site, of its own at each, or alike at all; a force at one site and a
+  declared term that swing at one frequency; a force that travels as a wave.
 - Smooth forces in space and time: nets for whatever else there is.
 """
 
@@ -25,6 +26,7 @@ from systems.effects import Effect
 from systems.terms import Term
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
     from numpy import ndarray
 
 REAL_TERMS = (
@@ -46,7 +48,7 @@ COMPLEX_TERMS = (
 DEGREES, HALF_WAVES = 12, 6
 MODES = 6
 # Half waves of a course in time at one place; fewer where the columns of all sites would be more numbers than this.
-COURSE, MOST_NUMBERS = 12, 20_000_000
+COURSE, MOST_NUMBERS = 16, 20_000_000
 # Half waves of what is alike at all sites.
 SUPPLY = 24
 MOMENTS = 16
@@ -399,11 +401,36 @@ def _courses(tangent: Tangent) -> list[Group]:
         return np.concatenate(found, axis=1)
 
     every = tangent.columns(columns)
-    whole = attempt(tangent, Change(Effect("unnamed", "0")), every, random=True)
+    change = Change(Effect("unnamed", "0"))
+    beats = swings(waves)
+    tries = [
+        attempt(tangent, replace(change, site=site), own @ beat)
+        for site, own in zip(moving, np.split(every, len(moving), axis=1), strict=True)
+        for beat in _each_part(beats, parts, waves)
+    ]
     return [
         *group("a force at one site, of any course", at_each(tangent, every, moving, waves)),
-        *group("forces at all sites, of any course", [whole]),
+        *group("forces at all sites, of any course", [attempt(tangent, change, every, random=True)]),
+        *group("a force at one site that swings at one frequency", tries),
     ]
+
+
+def swings(waves: int) -> Float[ndarray, "frequencies waves two"]:
+    """Write cosine and sine of each frequency that so many half waves can show as sums of them; x runs from 0 to 1 in the record.
+
+    Frequencies are half a wave apart, so that one between two of them is within a quarter.
+    """
+    x = np.linspace(0, 1, 20 * waves)
+    halves = np.cos(np.pi * np.arange(waves) * x[:, None])
+    # Less than a whole wave is no wave; the highest are not those of the half waves alone.
+    angles = np.pi * np.arange(2, waves - 1)[:, None] * x
+    beats = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    return np.stack([np.linalg.lstsq(halves, beat, rcond=None)[0] for beat in beats])
+
+
+def _each_part(beats: ndarray, parts: int, waves: int) -> list[ndarray]:
+    """Let a swing act on each part of a field: columns are sorted as (waves, parts)."""
+    return [np.einsum("wb,pq->wpbq", beat, np.eye(parts)).reshape(waves * parts, -1) for beat in beats]
 
 
 def _unsteady(tangent: Tangent) -> list[Group]:
@@ -424,13 +451,15 @@ def _unsteady(tangent: Tangent) -> list[Group]:
 
     every = tangent.columns(columns)
     change = Change(Effect("unnamed", "0"))
-    force, *terms = (
-        attempt(tangent, change, one, random=True)
-        for one in np.split(every, every.shape[1] // (waves * dynamics.parts), axis=1)
-    )
+    kinds = np.split(every, every.shape[1] // (waves * dynamics.parts), axis=1)
+    force, *terms = (attempt(tangent, change, one, random=True) for one in kinds)
+    # A uniform force that does has a name; the field itself, too, which then does as well.
+    beats = _each_part(swings(waves), dynamics.parts, waves)
+    steady = [attempt(tangent, change, one @ beat) for one in kinds[1:] for beat in beats]
     return [
         *group("a force alike at all sites, of any course", [force]),
         *group("a term of any course in time", terms),
+        *group("a term that swings at one frequency", steady),
     ]
 
 
