@@ -36,7 +36,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-Kind = Literal["systems", "libraries", "methods", "suites"]
+Kind = Literal["systems", "libraries", "methods", "suites", "effects"]
 AnyEnds = Literal["unknown", "free", "fixed", "periodic", "antiperiodic"]
 KnownEnds = Literal["free", "fixed", "periodic", "antiperiodic"]
 # The library of a system that has the terms of its own equation.
@@ -128,7 +128,11 @@ def list_(
     """Say what there is."""
     from bench.screen import show_rows
 
-    rows = {"systems": _system_rows, "libraries": _library_rows, "methods": _method_rows, "suites": _suite_rows}[kind]()
+    makers = {
+        "systems": _system_rows, "libraries": _library_rows, "methods": _method_rows, "suites": _suite_rows,
+        "effects": _effect_rows,
+    }  # fmt: skip
+    rows = makers[kind]()
     if as_json:
         print(json.dumps(rows, indent=2))
         return
@@ -175,6 +179,19 @@ def _method_rows() -> list[dict[str, Any]]:
         {"name": name, "what it is": (kind.__doc__ or "").strip().splitlines()[0], "settings": settings(kind)}
         for name, kind in methods.registered().items()
     ]
+
+
+def _effect_rows() -> list[dict[str, Any]]:
+    from systems.effects import CATALOGUE, HOW
+
+    return [
+        {
+            "name": one.name, "formula": one.formula or "",
+            "of a complex field": one.formula if one.complex_field is None else one.complex_field, "how it acts": HOW[one.acts],
+            "what gives it away": one.look_for, "source": one.source,
+        }
+        for one in CATALOGUE
+    ]  # fmt: skip
 
 
 def _suite_rows() -> list[dict[str, Any]]:
@@ -331,7 +348,11 @@ def diagnose(
     from systems.files import write_text
     from systems.samples import read_all
 
-    if (system is None) == (terms is None):
+    if system is not None and (terms is not None or order is not None):
+        raise InputError(
+            "--system declares an equation and its order: give it alone, or --terms and --order without it"
+        )
+    if system is None and terms is None:
         raise InputError(
             'give --system, or --terms and --order, such as --terms "u[n+1]+u[n-1]-2*u[n]; sin(u[n])" --order 2'
         )

@@ -26,20 +26,25 @@ Acts = Literal[
     "everywhere", "harmonic", "pulse", "delayed", "long range", "alternating", "one site", "one equation", "every site",
     "ends", "offset", "gain", "curve", "clock", "rounding",
 ]  # fmt: skip
-"""How an effect acts.
+"""How an effect acts; `HOW` says what each means."""
 
-- everywhere: the formula, at every site and time;
-- harmonic: times cos(omega t) and sin(omega t), omega found;
-- pulse: times exp(-((t - at) / width)^2 / 2), at and width found;
-- delayed: of the field as it was `delay` before, delay found;
-- long range: sum over r >= 2 of (u_{n+r} + u_{n-r} - 2 u_n) / r^s, s found;
-- alternating: with the sign (-1)^k at site k;
-- one site: at one site only, the site found; every site: at each with a coefficient of its own;
-- one equation: the whole right-hand side of one site is scaled;
-- ends: the chain ends otherwise than declared;
-- offset, gain, curve, clock, rounding: of the instrument: y = u + b, g u, u + c u^2; the times are not what they are said
-  to be; y is a multiple of a step.
-"""
+HOW: dict[Acts, str] = {
+    "everywhere": "the formula, at every site and time",
+    "harmonic": "the formula times cos(omega t) and sin(omega t), at every site alike; omega found",
+    "pulse": "the formula times exp(-((t - at) / width)^2 / 2), at every site alike; at and width found",
+    "delayed": "the formula of the field as it was a delay before; delay found",
+    "long range": "sum over r >= 2 of (u_{n+r} + u_{n-r} - 2 u_n) / r^s; s found",
+    "alternating": "the formula with the sign (-1)^k at site k",
+    "one site": "the formula at one site only; site found",
+    "every site": "the formula at every site with a coefficient of its own",
+    "one equation": "the whole right-hand side of one site is scaled; site found",
+    "ends": "the chain ends otherwise than declared",
+    "offset": "the reading is u + b; site found, or a b for each",
+    "gain": "the reading is g u; site found, or a g for each",
+    "curve": "the reading is u + c u^2",
+    "clock": "the times are not what they are said to be: scaled, or each a little off",
+    "rounding": "the reading is a multiple of a step",
+}
 
 INSTRUMENT: tuple[Acts, ...] = ("offset", "gain", "curve", "clock", "rounding")
 
@@ -53,7 +58,7 @@ class Effect:
         formula: in the term language, for a second-order lattice and wherever the next two are None.
         first_order: for a first-order lattice; "" where it makes no sense there.
         complex_field: for a complex field; "" where it makes no sense there.
-        acts: how, see `Acts`.
+        acts: how, see `HOW`.
         real: for complex fields, the coefficient is real; otherwise it is complex: two real ones, of T and i*T.
         orders: of the time derivative that it makes sense for.
         takes: it only takes energy: the coefficient is negative.

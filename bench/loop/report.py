@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
     from bench.loop.repair import Candidate, Diagnosis, Round, Watcher
+    from systems.samples import Samples
 
 # Entries of a ranking that people are shown.
 SHOWN = 6
@@ -39,6 +40,8 @@ ROUNDING = 0.01
 DIVERGED = 1000.0
 # So many coefficients of one effect are listed one by one.
 LISTED = 8
+# So many times as far from the middle as any other reading of its site is no reading of the motion.
+STRAY = 10.0
 
 
 @dataclass(frozen=True)
@@ -373,10 +376,28 @@ def sentence(diagnosis: Diagnosis) -> str:
     return f"What the equation lacks: {listed}. Something more is left that nothing in the catalogue explains."
 
 
+def strays(samples: Samples) -> list[str]:
+    """Say which readings are so far from all others of their site that they can hardly be of the motion."""
+    found = []
+    for letter, field in (("u", samples.u), ("v", samples.v)):
+        for site, column in enumerate(() if field is None else field.T):
+            seen = np.flatnonzero(np.isfinite(column))
+            if len(seen) < 5:
+                continue
+            away = np.abs(column[seen] - np.median(column[seen].real) - 1j * np.median(column[seen].imag))
+            row, others = seen[np.argmax(away)], np.sort(away)[:-1]
+            if np.max(away) > STRAY * others[-1] > 0:
+                found.append(
+                    f"{samples.source}: {letter}{site + 1} at t = {samples.t[row]:g} is {column[row]:.4g}, more than {STRAY:g} times as "
+                    "far out as any other reading of that site. If it is a slip, leave the cell empty."
+                )
+    return found
+
+
 def notes(diagnosis: Diagnosis) -> list[str]:
     """Say what else a reader should know."""
-    found = []
     course = diagnosis.course
+    found = [text for samples in course.before.data for text in strays(samples)]
     steps = []
     for samples in course.after.data:
         values = (

@@ -54,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.mark.parametrize("kind", ["systems", "libraries", "methods", "suites"])
+@pytest.mark.parametrize("kind", ["systems", "libraries", "methods", "suites", "effects"])
 def test_lists_are_tables_for_people_and_json_for_programs(kind: str, tmp_path: Path) -> None:
     rows = json.loads(succeed("list", kind, "--json", cwd=tmp_path))
     shown = succeed("list", kind, cwd=tmp_path)

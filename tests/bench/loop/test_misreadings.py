@@ -53,6 +53,15 @@ def humming(u, _rate):
     return wave[:, None, None] * np.ones_like(u), 0 * u
 
 
+def flickering(u, rate):
+    bright = np.random.default_rng(7).normal(size=len(u))[:, None, None]
+    return bright * u, bright * rate
+
+
+def lifted(u, _rate):
+    return np.random.default_rng(7).normal(size=len(u))[:, None, None] * np.ones_like(u), 0 * u
+
+
 def scanned(u, rate):
     return rate * np.arange(u.shape[-1]), 0 * u
 
@@ -63,6 +72,8 @@ def scanned(u, rate):
     [
         (sticking, "readings wrong by a function of the rate", None),
         (humming, "a hum in all readings", None),
+        (flickering, "readings scaled at each time by its own", None),
+        (lifted, "readings lifted at each time by its own", None),
         (scanned, "readings late, each site's by its own", None),
         (clipped, "readings wrong by a function of the field", None),
         (mixed, "readings mixed with the neighbours'", None),

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 import systems
 from bench.loop.model import Model
@@ -165,6 +166,84 @@ def two_at_once():
     u, v = (part + 0.005 * draw.normal(size=part.shape) for part in (y[:, :9], y[:, 9:]))
     u[:, 2] += 0.03
     return Samples(t, u, v, ends="free")
+
+
+def driven_chain(force):
+    """Twelve masses between walls, each pushed by the same force of the time: noisy u and v at 90 times."""
+    t, sites = np.linspace(0, 18, 90), 12
+
+    def rate(time, y):
+        u, v = np.split(y, 2)
+        padded = np.concatenate([[0.0], u, [0.0]])
+        return np.concatenate([v, padded[2:] + padded[:-2] - 2 * u - 0.4 * u + force(time)])
+
+    draw = np.random.default_rng(5)
+    start = np.concatenate([draw.normal(size=sites), draw.normal(size=sites)])
+    y = solve_ivp(rate, (0, 18), start, t_eval=t, rtol=1e-9, atol=1e-9).y.T
+    noisy = y + 0.01 * np.std(y, axis=0) * draw.normal(size=y.shape)
+    data = Samples(t, noisy[:, :sites], noisy[:, sites:], source="chain.csv", ends="fixed")
+    return diagnose(library("own", "u[n+1]+u[n-1]-2*u[n]; u[n]"), 2, [data], CATALOGUE)
+
+
+@pytest.mark.parametrize("size", [0.02, 0.2, 2.0])
+def test_a_drive_is_found_however_strong_it_is(size):
+    found = driven_chain(lambda t: size * np.cos(2.2 * t - 1))
+    assert found.course.verdict == "explained"
+    (change,) = found.course.after.model.changes
+    assert change.effect.name == "drive"
+    assert change.psi["omega"] == pytest.approx(2.2, abs=0.05 if size < 0.1 else 0.005)
+    assert found.residual[1] < 1.1
+
+
+def test_harmonics_that_stand_for_another_course_are_no_explanation():
+    """A motion that is pushed by three waves of no common frequency has no drive, however well a few of them do."""
+    found = driven_chain(lambda t: 0.05 * (np.cos(0.9 * t) + np.cos(1.7 * t + 1) + np.cos(2.9 * t + 2)))
+    assert found.course.verdict in ("unexplained", "partly explained")
+
+
+def test_names_that_leave_the_readings_lost_are_not_given():
+    """Forces as strong as the motion that nothing tells from noise: whatever comes nearest explains next to nothing of them."""
+    draw = np.random.default_rng(8)
+    t, sites = np.linspace(0, 12, 60), 8
+    pushes = CubicSpline(np.linspace(0, 12, 60), 0.8 * draw.normal(size=(60, sites)))
+
+    def rate(time, y):
+        u, v = np.split(y, 2)
+        padded = np.concatenate([[0.0], u, [0.0]])
+        return np.concatenate([v, padded[2:] + padded[:-2] - 2 * u - 0.4 * u + pushes(time)])
+
+    y = solve_ivp(rate, (0, 12), draw.normal(size=2 * sites), t_eval=t, rtol=1e-8, atol=1e-8).y.T
+    noisy = y + 0.01 * np.std(y, axis=0) * draw.normal(size=y.shape)
+    data = Samples(t, noisy[:, :sites], noisy[:, sites:], source="pushed.csv", ends="fixed")
+    found = diagnose(library("own", "u[n+1]+u[n-1]-2*u[n]; u[n]"), 2, [data], CATALOGUE)
+    assert found.course.verdict == "unexplained"
+    assert found.course.after is found.course.before
+    assert all(turn.added is None for turn in found.course.rounds)
+    assert found.course.left
+
+
+def test_disorder_has_a_mean_of_its_own_where_the_equation_has_no_such_term():
+    """Sine-Gordon declares sin u and no u: the sites' coefficients are those that were put in, not their deviations."""
+    t, sites = np.linspace(0, 8, 60), 9
+    draw = np.random.default_rng(2)
+    each = 0.25 * draw.normal(size=sites)
+
+    def rate(_, y):
+        u, v = np.split(y, 2)
+        beside = np.concatenate([u[1:], u[-1:]]) + np.concatenate([u[:1], u[:-1]])
+        return np.concatenate([v, 0.5 * (beside - 2 * u) - np.sin(u) + each * u])
+
+    y = solve_ivp(rate, (0, 8), 1.5 * draw.normal(size=2 * sites), t_eval=t, rtol=1e-9, atol=1e-9).y.T
+    noisy = y + 0.005 * np.std(y, axis=0) * draw.normal(size=y.shape)
+    system = systems.find("sine-gordon")
+    data = Samples(t, noisy[:, :sites], noisy[:, sites:], source="uneven.csv", ends="free")
+    found = diagnose(system.library("equation"), 2, [data], CATALOGUE)
+    (change,) = found.course.after.model.changes
+    assert change.effect.name == "disorder"
+    solution = found.course.after.solution
+    fitted, error = solution.state.coefficients[2:], np.sqrt(np.diag(solution.covariance))[2:]
+    assert len(fitted) == sites
+    assert np.max(np.abs(fitted - each) / error) < 4
 
 
 def test_of_two_effects_at_once_both_are_found_with_their_sizes():

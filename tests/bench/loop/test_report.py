@@ -466,3 +466,14 @@ def test_a_page_is_written_whole_or_not_at_all(damped: Diagnosis, tmp_path: Path
         write_page(damped, {}, tmp_path / "file" / "page.html")
     write_page(damped, {}, tmp_path / "new" / "page.html")
     assert (tmp_path / "new" / "page.html").read_text().endswith("</html>\n")
+
+
+def test_a_reading_far_beyond_all_others_is_pointed_at():
+    t = np.linspace(0, 4, 30)
+    u = np.stack([np.cos(t), np.sin(3 * t)], axis=1)
+    assert report.strays(Samples(t, u, source="swing.csv")) == []
+    u[7, 1] = 1e6
+    v = np.zeros_like(u)
+    (text,) = report.strays(Samples(t, u, v, source="swing.csv"))
+    assert text.startswith(f"swing.csv: u2 at t = {t[7]:g} is 1e+06")
+    assert "empty" in text

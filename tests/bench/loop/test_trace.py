@@ -10,11 +10,11 @@ from scipy.stats import chi2
 
 import systems
 from bench.loop import trace
-from bench.loop.model import Model, first_fit
+from bench.loop.model import Model, cut, first_fit
 from bench.loop.specimen import make
 from bench.loop.tangent import linearise
 from bench.loop.trace import Finding, rank, rarity, screen, tail
-from bench.loop.ways import step_of, ways
+from bench.loop.ways import frequencies, step_of, ways
 from systems.effects import CATALOGUE, find
 
 SMALL = {"sites": 9, "samples": 30, "span": 6.0}
@@ -125,6 +125,17 @@ def test_noise_makes_no_effect_significant():
     for seed in range(3):
         tangent, _ = tangent_of("phi4", "none", 0, seed, variation=True)
         assert significant(screen(tangent, CATALOGUE, np.random.default_rng(0), 60)) == ()
+
+
+def test_pieces_of_a_record_are_searched_at_the_frequencies_of_the_whole():
+    system = systems.find("phi4")
+    one = make(system, "none", 0.0, np.random.default_rng(1), sites=9, samples=60, span=12.0)
+    whole = [replace(one.samples.observed(), ends=system.ends)]
+    model = Model(system.library("equation"), system.order)
+    found = [frequencies(linearise(first_fit(model, cut(whole, length)))) for length in (60, 12)]
+    assert len(cut(whole, 12)) == 5
+    np.testing.assert_allclose(found[1], found[0])
+    assert found[0][0] == pytest.approx(2 * np.pi / (whole[0].t[-1] - whole[0].t[0]))
 
 
 # Places and frequencies -------------------------------------------------------------------------------------------------------

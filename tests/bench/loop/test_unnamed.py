@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import systems
 from bench.loop import unnamed
@@ -18,6 +19,7 @@ from bench.loop.tangent import linearise
 from bench.loop.trace import screen
 from systems.effects import CATALOGUE
 from systems.lattice import library
+from systems.samples import Samples
 
 # What is left of a force of z = 40 is then as large as one standard error.
 FAITHFUL = 0.03
@@ -134,6 +136,9 @@ def test_a_term_that_changes_in_time_and_along_the_chain_is_a_sum_of_products():
         ("dnls", "other: stray-wire", "a bond between two distant sites"),
         ("ginzburg-landau", "other: retarded-coupling", "a term that comes late"),
         ("sine-gordon", "other: shared-inertia", "a term that acts on the neighbours"),
+        ("phi4", "other: shaken-end", "a force at one site that swings at one frequency"),
+        ("dnls", "other: pumped-coupling", "a term that swings at one frequency"),
+        ("phi4", "other: unsteady-supply", "a term of any course in time"),
     ],
 )
 def test_a_bond_or_term_in_an_unusual_place_comes_before_every_name(system, effect, name):
@@ -166,6 +171,38 @@ def test_a_name_that_comes_near_is_not_given_where_a_term_without_one_does_bette
     )
     assert one.apart > 5
     assert found.course.verdict in ("unexplained", "partly explained")
+
+
+def test_a_swing_is_a_sum_of_half_waves():
+    x = np.linspace(0, 1, 333)
+    halves = np.cos(np.pi * np.arange(16) * x[:, None])
+    for k, beat in zip(range(2, 15), unnamed.swings(16), strict=True):
+        wanted = np.stack([np.cos(np.pi * k * x), np.sin(np.pi * k * x)], axis=1)
+        assert np.sqrt(np.mean((halves @ beat - wanted) ** 2)) < 0.2
+
+
+def test_a_term_that_is_another_at_one_site_is_found_there():
+    """Damping at one site only: the catalogue has it everywhere, and a defect of the field."""
+    system = systems.find("phi4")
+    xi = system.truth(system.library("equation"), {})
+    t, sites = np.linspace(0, 10, 50), 9
+    draw = np.random.default_rng(4)
+
+    def rate(_, y):
+        u, v = np.split(y, 2)
+        beside = np.concatenate([u[1:], u[-1:]]) + np.concatenate([u[:1], u[:-1]])
+        force = xi[0] * (beside - 2 * u) + xi[1] * u + xi[2] * u**3
+        force[6] -= 0.2 * v[6]
+        return np.concatenate([v, force])
+
+    start = np.concatenate([1 + 0.3 * draw.normal(size=sites), 0.3 * draw.normal(size=sites)])
+    y = solve_ivp(rate, (0, 10), start, t_eval=t, rtol=1e-9, atol=1e-9).y.T
+    noisy = y + 0.005 * np.std(y, axis=0) * draw.normal(size=y.shape)
+    data = [Samples(t, noisy[:, :sites], noisy[:, sites:], source="absorber.csv", ends="free")]
+    found = diagnose(system.library("equation"), 2, data, CATALOGUE)
+    assert found.course.verdict == "unexplained"
+    first = found.course.left[0]
+    assert (first.name, first.change.site) == ("a term that is another at one site", 6)
 
 
 def test_a_drive_has_at_least_one_wave_in_the_record():
