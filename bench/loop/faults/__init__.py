@@ -1,7 +1,7 @@
 """What may be wrong with a chain or with the instrument: faults that recordings are made with, to see whether the loop finds them.
 
 They are made apart from the loop: plain NumPy forces beside the system's own right-hand side, SciPy's integrators, and the instrument's
-faults put on afterwards. Three sets from outside the catalogue are blind: whoever made them had not looked at how the diagnosis works.
+faults put on afterwards. Four sets from outside the catalogue are blind: whoever made them had not looked at how the diagnosis works.
 """
 
 from __future__ import annotations
@@ -61,6 +61,8 @@ SECOND_ORDER = (
     "other: wavy-drag",
     "other: lopsided-bonds",
     "other: bent-damper",
+    # For order 1, where a brake would be loss in proportion to u, this is a defect.
+    "other: braked-site",
 )
 COMPLEX = ("other: phase-conjugation", "other: nonlocal-response")
 REAL = ("damping", "nonlinear-loss", "gain-loss", "disorder")
@@ -113,7 +115,14 @@ THIRD_BLIND = {
     "other: averaging-readout": _misread(instrument.averaged),
     "other: floating-ground": _misread(instrument.grounded),
 }
-OTHERS = {**_pushing(pushes.PLAIN), **BLIND, **SECOND_BLIND, **THIRD_BLIND}
+FOURTH_BLIND = {
+    **_pushing(pushes.FOURTH_BLIND),
+    "other: inner-resonators": Fault(unseen.inner_resonators),
+    "other: tilted-camera": _misread(instrument.tilted),
+    "other: stray-spikes": _misread(instrument.spiked),
+    "other: ac-coupling": _misread(instrument.blocked),
+}
+OTHERS = {**_pushing(pushes.PLAIN), **BLIND, **SECOND_BLIND, **THIRD_BLIND, **FOURTH_BLIND}
 FAULTS = {**CATALOGUED, **OTHERS}
 
 
@@ -134,6 +143,7 @@ def sensible(name: str, system: System) -> bool:
 __all__ = [
     "BLIND",
     "FAULTS",
+    "FOURTH_BLIND",
     "NONE",
     "OTHERS",
     "PUSHES",

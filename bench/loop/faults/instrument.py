@@ -144,6 +144,32 @@ def grounded(setting: Setting, size: float) -> Fields:
     return _lowered(u, size), None if v is None else _lowered(v, size)
 
 
+def tilted(setting: Setting, size: float) -> Fields:
+    """Watch the chain with a camera that is not square to it: the scale grows from one end to the other by 2 size of its mean."""
+    n = setting.drawn.n
+    return _scaled(setting.run(), 1 + size * n / np.max(n))
+
+
+def spiked(setting: Setting, size: float) -> Fields:
+    """Let a few readings of u be off by about the size, up or down."""
+    u, v = setting.run()
+    return u + size * setting.drawn.spikes, v
+
+
+def blocked(setting: Setting, size: float) -> Fields:
+    """Lead all sensors of u through capacitors, y' = u' - size y, which let what is constant fade.
+
+    They are uncharged at the start. Between the steps of a fine grid the field is taken as straight, for which this is exact.
+    """
+    fine = setting.fine()
+    u, v = fine.run()
+    shown = u.copy()
+    for k, step in enumerate(np.diff(fine.times)):
+        gone = -np.expm1(-size * step)
+        shown[k + 1] = shown[k] * (1 - gone) + (u[k + 1] - u[k]) * gone / (size * step)
+    return shown[::FINE], None if v is None else v[::FINE]
+
+
 def _lowered(field: ndarray, size: float) -> ndarray:
     return np.asarray(field - size * np.mean(field, axis=1, keepdims=True))
 

@@ -48,6 +48,11 @@ class Moment:
         about = self.drawn.about
         return float(np.cos(about["omega"] * self.t + about["phase"]))
 
+    def sweep(self) -> float:
+        """Give the drive whose frequency rises all the time."""
+        about = self.drawn.about
+        return float(np.cos((about["omega"] + about["sweep"] * self.t / 2) * self.t + about["phase"]))
+
     def waves(self, x: ndarray) -> ndarray:
         """Give a drawn smooth function of a number at each site: three waves."""
         return np.asarray(np.sum(np.cos(self.drawn.shape[0] * x[:, None] + self.drawn.shape[1]), axis=1))
@@ -86,6 +91,12 @@ def between(m: Moment) -> ndarray:
     """Give the velocities' second difference."""
     velocities = replace(m, u=m.v)
     return np.asarray(velocities.stretch(1) + velocities.stretch(-1))
+
+
+def steepening(m: Moment) -> ndarray:
+    """Give the slope of the field's cube, which moves high parts of a wave faster than low ones."""
+    cubes = replace(m, u=np.abs(m.u) ** 2 * m.u)
+    return np.asarray((cubes.neighbour(1) - cubes.neighbour(-1)) / 2)
 
 
 # By the catalogue's names.
@@ -152,7 +163,16 @@ THIRD_BLIND: dict[str, Callable[[Moment], ndarray]] = {
     "other: bent-damper": lambda m: -(np.abs(m.u) ** 2) * m.v,
 }
 
-PUSHES = {**CATALOGUED, **PLAIN, **FIRST_BLIND, **SECOND_BLIND, **THIRD_BLIND}
+FOURTH_BLIND: dict[str, Callable[[Moment], ndarray]] = {
+    "other: uneven-floor": lambda m: m.drawn.each,
+    "other: sweeping-drive": lambda m: m.sweep() * np.ones(len(m.u)),
+    "other: braked-site": lambda m: -np.eye(len(m.u))[m.drawn.site] * m.v,
+    "other: tapped-site": lambda m: m.pulse() * np.eye(len(m.u))[m.drawn.site],
+    "other: one-way-bond": lambda m: np.eye(len(m.u))[m.drawn.site] * m.stretch(1),
+    "other: self-steepening": steepening,
+}
+
+PUSHES = {**CATALOGUED, **PLAIN, **FIRST_BLIND, **SECOND_BLIND, **THIRD_BLIND, **FOURTH_BLIND}
 
 
 def push(setting: Setting, amounts: dict[str, complex]) -> Push:

@@ -41,6 +41,7 @@ class Drawn:
         pickup: how much hum each sensor's wires catch (N,).
         supply: frequencies and phases of an unsteady supply (2, 5).
         flicker: how much brighter than usual each row is lit (T,).
+        spikes: by how much each reading is off, 0 for nearly all of them (T, N).
     """
 
     about: Mapping[str, float]
@@ -58,6 +59,7 @@ class Drawn:
     pickup: Float[ndarray, " sites"]
     supply: Float[ndarray, "two waves"]
     flicker: Float[ndarray, " time"]
+    spikes: Float[ndarray, "time sites"]
 
     @property
     def site(self) -> int:
@@ -157,7 +159,8 @@ def draw_all(name: str, sites: int, times: ndarray, draw: np.random.Generator) -
     `s` of a long-range coupling, and the `middle` of the record; `wave_number` of a travelling force, `spot`, `speed` and `breadth` of a
     moving one, frequency `own` of a resonator, `warming`, a sensor's time; `wire_from` and `wire_to`, the sites at the ends of a wire,
     `grip`, the most that a slipping spring is bent, `cooling`, the time in which heat goes, `fading` length of a response, `hum` and
-    `hum_phase`, frequency and phase of the mains; `play`, how far a site goes before it meets a stop, `sway`, frequency of a mount.
+    `hum_phase`, frequency and phase of the mains; `play`, how far a site goes before it meets a stop, `sway`, frequency of a mount; `sweep`,
+    by how much a drive's frequency rises in a unit of time.
     """
     span = float(times[-1] - times[0])
     n = np.arange(sites) - (sites - 1) / 2
@@ -212,7 +215,12 @@ def draw_all(name: str, sites: int, times: ndarray, draw: np.random.Generator) -
     about |= {"play": more.uniform(0.3, 0.7), "sway": more.uniform(1.0, 4.0)}
     supply = np.stack([more.uniform(2 * np.pi / span, 6.0, size=5), more.uniform(0, 2 * np.pi, size=5)])
     flicker = more.normal(size=len(times))
+    about["sweep"] = more.uniform(2.0, 5.0) / span
+    # One reading in a hundred, but a few in the shortest record, too.
+    hits = more.choice(len(times) * sites, size=max(len(times) * sites // 100, 3), replace=False)
+    spikes = np.zeros((len(times), sites))
+    spikes.flat[hits] = more.choice([-1.0, 1.0], size=len(hits)) * more.uniform(0.5, 1.5, size=len(hits))
     return Drawn(
         about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force, near, pickup,
-        supply, flicker,
+        supply, flicker, spikes,
     )  # fmt: skip

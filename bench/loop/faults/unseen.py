@@ -33,12 +33,18 @@ def retarded_coupling(setting: Setting, amount: complex) -> Fields:
 
 def side_resonator(setting: Setting, amount: complex) -> Fields:
     """Hang a resonator on one site."""
-    return _with_resonator(setting, amount, setting.one, float(setting.drawn.about["own"]))
+    return _with_resonators(setting, amount, setting.one[None], float(setting.drawn.about["own"]))
 
 
 def swaying_mount(setting: Setting, amount: complex) -> Fields:
     """Let the mount that all sites stand on sway."""
-    return _with_resonator(setting, amount, np.ones(setting.chain.sites), float(setting.drawn.about["sway"]))
+    hung = np.ones((1, setting.chain.sites))
+    return _with_resonators(setting, amount, hung, float(setting.drawn.about["sway"]))
+
+
+def inner_resonators(setting: Setting, amount: complex) -> Fields:
+    """Let each site have a resonator inside, all of them alike."""
+    return _with_resonators(setting, amount, np.eye(setting.chain.sites), float(setting.drawn.about["own"]))
 
 
 def slow_heating(setting: Setting, amount: complex) -> Fields:
@@ -91,27 +97,29 @@ def ends(setting: Setting, _amount: complex) -> Fields:
     return setting.other_ends().run()
 
 
-def _with_resonator(setting: Setting, amount: complex, hung: ndarray, own: float) -> Fields:
-    """Integrate with something unseen hung on some sites (N,), 1 for each of them, which pulls all these by amount (w - m).
+def _with_resonators(setting: Setting, amount: complex, hung: ndarray, own: float) -> Fields:
+    """Integrate with unseen things, each hung on some sites (things, N), 1 for each of them, which it pulls by amount (w - m).
 
     m is their mean. Its own motion is w'' = own^2 (m - w), or w' = own (m - w), times i for a complex field; it starts as they do.
     """
     chain = setting.chain
     rate, size = chain.right_hand_side, chain.parts * chain.sites
     turn = 1j if chain.is_complex else 1.0
-    share = hung / np.sum(hung)
+    share = hung / np.sum(hung, axis=1, keepdims=True)
+    # Each has a place and a speed, with two parts each.
+    unseen = 4 * len(hung)
 
     def coupled(t: float, y: ndarray) -> ndarray:
-        change, mean = rate(t, y[:-4]), share @ chain.unpack(y[:-4])[0]
-        w, speed = y[-4:].view(complex)
-        pull = amount * (w - mean) * hung
+        change, mean = rate(t, y[:-unseen]), share @ chain.unpack(y[:-unseen])[0]
+        w, speed = np.split(y[-unseen:].view(complex), 2)
+        pull = amount * (w - mean) @ hung
         change[-size:] += setting.parts(pull if chain.is_complex else pull.real)
-        hidden = [speed, own**2 * (mean - w)] if chain.order == 2 else [turn * own * (mean - w), 0.0]
-        return np.concatenate([change, np.array(hidden, complex).view(float)])
+        hidden = [speed, own**2 * (mean - w)] if chain.order == 2 else [turn * own * (mean - w), 0 * w]
+        return np.concatenate([change, np.concatenate(hidden).astype(complex).view(float)])
 
     u, v = chain.unpack(setting.start)
-    hidden = np.array([share @ u, 0.0 if v is None else share @ v], complex).view(float)
-    return chain.unpack(integrated(coupled, np.concatenate([setting.start, hidden]), setting.times)[:-4])
+    hidden = np.concatenate([share @ u, 0 * (share @ u) if v is None else share @ v]).astype(complex).view(float)
+    return chain.unpack(integrated(coupled, np.concatenate([setting.start, hidden]), setting.times)[:-unseen])
 
 
 def _with_hidden(

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import systems
-from bench.loop.faults import BLIND, FAULTS, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND, sensible
+from bench.loop.faults import BLIND, FAULTS, FOURTH_BLIND, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND, sensible
 from bench.loop.model import Model, first_fit
 from bench.loop.specimen import make
 from systems.effects import CATALOGUE
@@ -35,7 +35,7 @@ SOME = [
     ("dnls", "memory"), ("dnls", "quantisation"), ("dnls", "sensor-offset"), ("phi4", "other: moving-spot"),
     ("phi4", "other: slow-sensor"), ("dnls", "other: side-resonator"), ("dnls", "other: retarded-coupling"),
     ("phi4", "other: slipping-spring"), ("dnls", "other: slow-heating"), ("dnls", "other: scanned-channels"),
-    ("phi4", "other: mains-hum"),
+    ("phi4", "other: mains-hum"), ("dnls", "other: inner-resonators"), ("phi4", "other: stray-spikes"),
 ]  # fmt: skip
 
 
@@ -115,6 +115,12 @@ def neighbours(u):
     return np.concatenate([u[1:], u[-1:]]) + np.concatenate([u[:1], u[:-1]])
 
 
+def rising(about, t):
+    """A drive whose angle is the integral of a frequency that rises."""
+    s = np.linspace(0, t, 3)
+    return np.cos(about["phase"] + np.trapezoid(about["omega"] + about["sweep"] * s, s))
+
+
 def truth_of(name):
     """The declared equation's true coefficients."""
     system = systems.find(name)
@@ -126,7 +132,8 @@ def truth_of(name):
     [
         "damping", "drive", "defect", "next-neighbour", "unequal-masses", "gradient", "other: lopsided-bonds", "other: moving-spot",
         "other: plane-wave", "other: stray-wire", "other: pumped-coupling", "other: shaken-end", "other: three-body",
-        "other: bent-damper", "other: end-stops",
+        "other: bent-damper", "other: end-stops", "other: sweeping-drive", "other: braked-site", "other: tapped-site",
+        "other: one-way-bond", "other: self-steepening",
     ],
 )  # fmt: skip
 def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
@@ -164,6 +171,11 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
         "other: three-body": lambda _t, u, _v: np.append(u[1:], u[-1]) * u * np.append(u[0], u[:-1]),
         "other: bent-damper": lambda _t, u, v: -(u**2) * v,
         "other: end-stops": lambda _t, u, _v: -(u - np.clip(u, begin - about["play"], begin + about["play"])),
+        "other: sweeping-drive": lambda t, u, _v: rising(about, t) + 0 * u,
+        "other: braked-site": lambda _t, _u, v: -at * v,
+        "other: tapped-site": lambda t, _u, _v: at * np.exp(-0.5 * ((t - about["at"]) / about["width"]) ** 2),
+        "other: one-way-bond": lambda _t, u, _v: at * np.diff(u, append=u[-1]),
+        "other: self-steepening": lambda _t, u, _v: (np.append(u[1:], u[-1]) ** 3 - np.append(u[0], u[:-1]) ** 3) / 2,
     }
     begin = one.clean.u[0]
 
@@ -185,13 +197,15 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
     [
         ("nonlinear-loss", -1), ("asymmetric-coupling", 1), ("other: phase-conjugation", 1), ("other: plane-wave", 1),
         ("other: stray-wire", 1), ("other: nonlocal-response", 1), ("other: pumped-coupling", 1), ("other: three-body", 1),
-        ("other: end-stops", -1),
+        ("other: end-stops", -1), ("other: sweeping-drive", 1), ("other: tapped-site", 1), ("other: one-way-bond", 1),
+        ("other: self-steepening", 1),
     ],
 )  # fmt: skip
 def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
     one = drawn("dnls", effect, z=40, noise=0.05)
     coupling, cubic = truth_of("dnls")
     about = one.about
+    at = np.eye(7)[int(about["site"])]
     left, right = int(about["wire_from"]), int(about["wire_to"])
     extras = {
         "nonlinear-loss": lambda _, u: abs(u) ** 2 * u,
@@ -211,6 +225,12 @@ def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
         "other: three-body": lambda _, u: np.append(u[1:], u[-1]) * np.conj(u) * np.append(u[0], u[:-1]),
         "other: end-stops": lambda _, u: (
             np.exp(1j * np.angle(u - begin)) * np.maximum(abs(u - begin) - about["play"], 0)
+        ),
+        "other: sweeping-drive": lambda t, _: rising(about, t),
+        "other: tapped-site": lambda t, _: at * np.exp(-0.5 * ((t - about["at"]) / about["width"]) ** 2),
+        "other: one-way-bond": lambda _, u: at * np.diff(u, append=u[-1]),
+        "other: self-steepening": lambda _, u: np.convolve(
+            np.pad(u * u * u.conj(), 1, "edge"), [0.5, 0, -0.5], "valid"
         ),
     }
     begin = one.clean.u[0]
@@ -294,6 +314,56 @@ def test_an_unsteady_supply_changes_the_linear_term_of_all_sites_alike():
     # Five waves around nothing.
     assert np.max(np.abs(supply)) < 5 * abs(np.real(one.amount))
     assert np.min(supply) < 0 < np.max(supply)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_an_uneven_floor_pushes_each_site_always_the_same_way(name):
+    one = drawn(name, "other: uneven-floor", z=40, noise=0.05, samples=400)
+    t, u = one.clean.t, one.clean.u
+    xi = truth_of(name)
+    if name == "dnls":
+        own = np.array([1j * xi[0] * (neighbours(row) - 2 * row) + 1j * xi[1] * abs(row) ** 2 * row for row in u])
+    else:
+        own = np.array([xi[0] * (neighbours(row) - 2 * row) + xi[1] * row + xi[2] * row**3 for row in u])
+    missing = (CubicSpline(t, u if name == "dnls" else one.clean.v)(t, 1) - own)[20:-20]
+    force = np.mean(missing, axis=0) / one.amount
+    assert np.max(np.abs(missing / one.amount - force)) < 0.01 * np.max(np.abs(force))
+    assert np.max(np.abs(np.imag(force))) < 1e-3
+    # As uneven as normal numbers are, to either side.
+    assert 0.3 < np.std(np.real(force)) < 2
+    assert np.min(np.real(force)) < 0 < np.max(np.real(force))
+
+
+def test_each_site_has_a_resonator_inside():
+    one = drawn("phi4", "other: inner-resonators", z=40, noise=0.05)
+    amount, own = np.real(one.amount), one.about["own"]
+    xi = truth_of("phi4")
+
+    def rate(_, y):
+        u, v, w, speed = np.split(y, 4)
+        force = xi[0] * (neighbours(u) - 2 * u) + xi[1] * u + xi[2] * u**3 + amount * (w - u)
+        return np.concatenate([v, force, speed, own**2 * (u - w)])
+
+    t, u, v = one.clean.t, one.clean.u, one.clean.v
+    start = np.concatenate([u[0], v[0], u[0], v[0]])
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(u, y[:, :7], atol=1e-6)
+    np.testing.assert_allclose(v, y[:, 7:14], atol=1e-6)
+
+
+def test_each_site_of_a_complex_field_has_a_resonator_inside():
+    one = drawn("dnls", "other: inner-resonators", z=40, noise=0.05)
+    own = one.about["own"]
+    coupling, cubic = truth_of("dnls")
+
+    def rate(_, y):
+        u, w = np.split(y, 2)
+        change = 1j * coupling * (neighbours(u) - 2 * u) + 1j * cubic * abs(u) ** 2 * u + one.amount * (w - u)
+        return np.concatenate([change, 1j * own * (u - w)])
+
+    t, start = one.clean.t, np.tile(one.clean.u[0], 2).astype(complex)
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(one.clean.u, y[:, :7], atol=1e-6)
 
 
 def test_a_complex_resonator_turns_at_its_own_frequency():
@@ -388,6 +458,7 @@ LIE_ABOUT_BOTH = (
     "other: flickering-lamp",
     "other: averaging-readout",
     "other: floating-ground",
+    "other: tilted-camera",
 )
 
 
@@ -523,6 +594,38 @@ def test_a_floating_ground_is_lifted_by_the_mean_of_all_sites(name):
     np.testing.assert_allclose(true - shown, np.real(one.amount) * lifted, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_tilted_camera_shows_one_end_too_large_and_the_other_too_small(name):
+    shown, true, one = lied(name, "other: tilted-camera")
+    scale = 1 + np.real(one.amount) * np.linspace(-1, 1, 7)
+    np.testing.assert_allclose(shown, scale * true, atol=1e-12)
+    if name == "phi4":
+        np.testing.assert_allclose(one.clean.v, scale * drawn(name, NONE).clean.v, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_stray_spikes_are_few_and_leave_the_other_readings_alone(name):
+    shown, true, one = lied(name, "other: stray-spikes", samples=100)
+    size, off = np.real(one.amount), (shown - true)[shown != true]
+    assert len(off) == 7
+    assert np.max(np.abs(off.imag)) == 0
+    assert np.all((np.abs(off) > 0.499 * size) & (np.abs(off) < 1.501 * size))
+    # In the shortest record, too.
+    few, sound, _ = lied(name, "other: stray-spikes")
+    assert np.sum(few != sound) == 3
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_behind_a_capacitor_what_is_constant_fades(name):
+    shown, true, one = lied(name, "other: ac-coupling", samples=200)
+    leak, t = np.real(one.amount), one.clean.t
+    assert leak > 0
+    np.testing.assert_allclose(shown[0], true[0], atol=1e-12)
+    # What is not shown is on the capacitor, which the shown voltage charges.
+    charged = CubicSpline(t, shown).antiderivative()(t)
+    np.testing.assert_allclose(true - shown, leak * charged, atol=1e-3 * np.max(np.abs(true - shown)))
+
+
 def test_making_one_does_not_call_the_dynamics_that_fits_use(monkeypatch):
     """But for the size, which is measured on the plain motion, everything is made without it."""
     from bench.loop import specimen
@@ -574,9 +677,9 @@ def test_what_the_equation_has_already_is_no_effect_of_it(name):
 
 
 def test_the_blind_sets_are_outside_the_catalogue_and_beside_each_other():
-    assert [len(BLIND), len(SECOND_BLIND), len(THIRD_BLIND)] == [10, 8, 10]
-    assert len(OTHERS) == 12 + 10 + 8 + 10
-    assert {*BLIND, *SECOND_BLIND, *THIRD_BLIND} < set(OTHERS)
+    assert [len(BLIND), len(SECOND_BLIND), len(THIRD_BLIND), len(FOURTH_BLIND)] == [10, 8, 10, 10]
+    assert len(OTHERS) == 12 + 10 + 8 + 10 + 10
+    assert {*BLIND, *SECOND_BLIND, *THIRD_BLIND, *FOURTH_BLIND} < set(OTHERS)
     assert not set(OTHERS) & {one.name for one in CATALOGUE}
 
 
@@ -585,6 +688,7 @@ def test_a_fault_is_for_lattices_that_can_have_it():
     assert not sensible("other: lopsided-bonds", systems.find("dnls"))
     assert not sensible("other: nonlocal-response", systems.find("sine-gordon"))
     assert not sensible("other: slipping-spring", systems.find("ginzburg-landau"))
+    assert not sensible("other: braked-site", systems.find("dnls"))
 
 
 def test_every_effect_of_the_catalogue_can_be_made():
