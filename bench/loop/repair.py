@@ -58,8 +58,6 @@ MOST_EFFECTS = 4
 POLISH = 8
 # A residual of more than so many times the noise is gross: the model is then followed over shorter pieces.
 GROSS = 3.0
-# Over pieces on which a model is off by less than so many times more than on the shortest, it does not lose the readings any more than on those.
-LOST = 2.0
 # Names that leave the readings lost, and more than this share of what was beyond the noise, are none.
 HARDLY = 0.5
 # What cannot be told from an effect has at least this share of its evidence.
@@ -412,23 +410,13 @@ class Horizon:
         return self.follows(fitted) and max(len(samples.t) for samples in fitted.data) >= self.lengths[0]
 
     def first(self, model: Model, start: Float[ndarray, " terms"] | None = None) -> Fitted:
-        """Fit a model as far as it can follow.
-
-        Where it never does, to the longest pieces over which it is not much farther off than over the shortest: what a strong force does in
-        step with the time is seen best over long ones.
-        """
-        tried: list[Fitted] = []
+        """Fit a model as far as it can follow; the shortest pieces where it never does."""
         for length in self.lengths:
             last = length == self.lengths[-1]
-            tried.append(first_fit(model, cut(self.data, length), steps=40 if last else 15, coefficients=start))
-            if self.follows(tried[-1]):
-                return tried[-1]
-        least = min(over_noise(one, self.noise) for one in tried if one.solution.converged or one is tried[-1])
-        return next(
-            one
-            for one in tried
-            if one is tried[-1] or (one.solution.converged and over_noise(one, self.noise) < LOST * least)
-        )
+            fitted = first_fit(model, cut(self.data, length), steps=40 if last else 15, coefficients=start)
+            if self.follows(fitted):
+                break
+        return fitted
 
     def lengthen(self, fitted: Fitted) -> Fitted:
         """Fit a model to longer pieces as long as it follows them."""
@@ -521,15 +509,18 @@ def _contest(
     screened, fits, others = 0.0, 0, 0
     for one in findings:
         timed = one.change.effect.acts in TIMED
+        # Where the readings are lost such a one is fitted to see whether it finds them again; the others are measured against each other.
+        apart = timed and lost and one.named
         # What is plainly visible is screened roughly; and other ends change the motion by more than to first order. What has a frequency or
         # a time of its own can stand for nearly anything, and is not given that much.
         behind = window if timed else max(FAR if lost else window, ROUGH * screened)
         near = one.evidence > screened - behind or (one.change.ends is not None and one.evidence > EQUAL)
-        near = near or (timed and lost and one.evidence > EQUAL)
+        if apart:
+            near = one.evidence > EQUAL
         # A term without a name is measured as the names are, where the screen puts it beside them.
         if not one.named:
             near = bool(one.change.texts) and one.evidence > OTHER_SHARE * screened and others < OTHER_FITS
-        if not near or fits >= FULL_FITS:
+        if not near or (fits >= FULL_FITS and not apart):
             ranking.append(Candidate(one, one.gain, one.evidence, one.p))
             continue
         watcher(f"fitting {one.name}")
@@ -541,10 +532,10 @@ def _contest(
         # Of a random effect the evidence is that of its variance: a fit has as many coefficients as there are sites.
         again = one if one.random or "step" in one.change.psi else replace(one, gain=gain)
         ranking.append(Candidate(one, gain, again.evidence, again.p, with_it))
-        if one.named:
-            fits, screened = fits + 1, max(screened, one.evidence)
-        else:
+        if not one.named:
             others += 1
+        elif not apart:
+            fits, screened = fits + 1, max(screened, one.evidence)
     return sorted(ranking, key=lambda one: -one.evidence)
 
 
