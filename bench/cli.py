@@ -186,8 +186,8 @@ def _effect_rows() -> list[dict[str, Any]]:
 
     return [
         {
-            "name": one.name, "formula": one.formula or "",
-            "of a complex field": one.formula if one.complex_field is None else one.complex_field, "how it acts": HOW[one.acts],
+            "name": one.name, "second order, real": next(iter(one.texts(2, False)), ""),
+            "first order, complex": next(iter(one.texts(1, True)), ""), "how it acts": HOW[one.acts],
             "what gives it away": one.look_for, "source": one.source,
         }
         for one in CATALOGUE
