@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # Frequencies searched where the record is short; the strongest lines of the residual where it is long.
 MOST_FREQUENCIES = 120
+# Lines of a long record's residual that are looked at.
+LINES = 24
 LONG = 400
 PULSES, WIDTHS = 24, (0.02, 0.05, 0.12)
 DELAYS = 10
@@ -118,15 +120,26 @@ def frequencies(tangent: Tangent) -> ndarray:
         count = int(min(MOST_FREQUENCIES, 2 * span * highest / np.pi))
         return np.linspace(2 * np.pi / span, highest, max(count, 2))
     found = []
+    for t, series in _records(tangent):
+        even = np.linspace(t[0], t[-1], len(t))
+        # Twice as long as it is: a line between two frequencies is seen as well.
+        power = np.abs(np.fft.rfft(np.interp(even, t, series) * np.hanning(len(t)), 2 * len(t))) ** 2
+        omega = 2 * np.pi * np.fft.rfftfreq(2 * len(t), even[1] - even[0])
+        peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:])) + 1
+        peaks = peaks[omega[peaks] >= 2 * np.pi / span]
+        found.append(omega[peaks[np.argsort(-power[peaks])[:LINES]]])
+    return np.unique(np.concatenate(found))
+
+
+def _records(tangent: Tangent) -> list[tuple[ndarray, ndarray]]:
+    """Give times and the sites' mean residual of each record; pieces that follow each other in time are of one."""
+    records: list[list[tuple[ndarray, ndarray]]] = []
     for path, left in zip(tangent.paths, tangent.fitted.residuals(), strict=True):
         t = path.record.times
-        even = np.linspace(t[0], t[-1], len(t))
-        series = np.mean(left, axis=(2, 3))[:, 0]
-        power = np.abs(np.fft.rfft(np.interp(even, t, series) * np.hanning(len(t)))) ** 2
-        omega = 2 * np.pi * np.fft.rfftfreq(len(t), even[1] - even[0])
-        peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:])) + 1
-        found.append(omega[peaks[np.argsort(-power[peaks])[:12]]])
-    return np.unique(np.concatenate(found))
+        if not records or t[0] < records[-1][-1][0][-1]:
+            records.append([])
+        records[-1].append((t, np.mean(left, axis=(2, 3))[:, 0]))
+    return [(np.concatenate([t for t, _ in one]), np.concatenate([left for _, left in one])) for one in records]
 
 
 def _harmonic(tangent: Tangent, effect: Effect) -> list[Try | None]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 import systems
@@ -16,6 +17,8 @@ from bench.loop.tangent import linearise
 from bench.loop.trace import Finding, rank, rarity, screen, tail
 from bench.loop.ways import frequencies, step_of, ways
 from systems.effects import CATALOGUE, find
+from systems.lattice import library
+from systems.samples import Samples
 
 SMALL = {"sites": 9, "samples": 30, "span": 6.0}
 
@@ -136,6 +139,21 @@ def test_pieces_of_a_record_are_searched_at_the_frequencies_of_the_whole():
     assert len(cut(whole, 12)) == 5
     np.testing.assert_allclose(found[1], found[0])
     assert found[0][0] == pytest.approx(2 * np.pi / (whole[0].t[-1] - whole[0].t[0]))
+
+
+def test_a_strong_drive_is_among_the_frequencies_of_a_long_record_in_pieces():
+    """One pendulum, pushed so that its equation without the push loses it within a few swings."""
+    t = np.linspace(0, 60, 600)
+
+    def rate(time, y):
+        return [y[1], -np.sin(y[0]) + 0.2 * np.cos(0.7 * time)]
+
+    y = solve_ivp(rate, (0, 60), [0.5, 0.0], t_eval=t, rtol=1e-9, atol=1e-9).y
+    noisy = y + 0.005 * np.random.default_rng(1).normal(size=y.shape)
+    whole = [Samples(t, noisy[:1].T, noisy[1:].T, source="pushed.csv")]
+    found = frequencies(linearise(first_fit(Model(library("own", "sin(u[n])"), 2), cut(whole, 40))))
+    assert len(found) < 60
+    assert np.min(np.abs(found - 0.7)) < np.pi / 60
 
 
 # Places and frequencies -------------------------------------------------------------------------------------------------------
