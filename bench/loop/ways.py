@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from bench.loop.model import Change, far_matrix, pace
+from bench.loop.residual import of_dynamics
 from bench.loop.tangent import Path, Tangent, force_along, forces, orthonormal
 from systems.effects import Effect
+from systems.errors import InputError
 from systems.lattice import Ends
 from systems.terms import Term, express
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 # Frequencies searched where the record is short; the strongest lines of the residual where it is long.
 MOST_FREQUENCIES = 120
 # Lines of a long record's residual that are looked at.
-LINES = 24
+LINES = 12
 LONG = 400
 PULSES, WIDTHS = 24, (0.02, 0.05, 0.12)
 DELAYS = 10
@@ -123,23 +125,61 @@ def frequencies(tangent: Tangent) -> ndarray:
     for t, series in _records(tangent):
         even = np.linspace(t[0], t[-1], len(t))
         # Twice as long as it is: a line between two frequencies is seen as well.
-        power = np.abs(np.fft.rfft(np.interp(even, t, series) * np.hanning(len(t)), 2 * len(t))) ** 2
         omega = 2 * np.pi * np.fft.rfftfreq(2 * len(t), even[1] - even[0])
-        peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:])) + 1
-        peaks = peaks[omega[peaks] >= 2 * np.pi / span]
-        found.append(omega[peaks[np.argsort(-power[peaks])[:LINES]]])
+        for parts in series:
+            evenly = np.stack([np.interp(even, t, part) for part in parts.T])
+            power = np.sum(np.abs(np.fft.rfft(evenly * np.hanning(len(t)), 2 * len(t))) ** 2, axis=0)
+            peaks = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:])) + 1
+            peaks = peaks[omega[peaks] >= 2 * np.pi / span]
+            found.append(omega[peaks[np.argsort(-power[peaks])[:LINES]]])
     return np.unique(np.concatenate(found))
 
 
-def _records(tangent: Tangent) -> list[tuple[ndarray, ndarray]]:
-    """Give times and the sites' mean residual of each record; pieces that follow each other in time are of one."""
-    records: list[list[tuple[ndarray, ndarray]]] = []
-    for path, left in zip(tangent.paths, tangent.fitted.residuals(), strict=True):
-        t = path.record.times
-        if not records or t[0] < records[-1][-1][0][-1]:
+def _records(tangent: Tangent) -> list[tuple[Float[ndarray, " time"], list[Float[ndarray, "time parts"]]]]:
+    """Give times of each record, and what may show the line of a drive there, averaged over the sites.
+
+    That is what is left of the readings; and, as that of pieces has the lines of how they were cut, too, what the model's terms with any
+    coefficients leave of the highest derivative, by itself (a drive) and times the field (a parametric one). Pieces that follow each
+    other in time are of one record.
+    """
+    records: list[list[int]] = []
+    paths = tangent.paths
+    for number, path in enumerate(paths):
+        if not records or path.record.times[0] < paths[number - 1].record.times[-1]:
             records.append([])
-        records[-1].append((t, np.mean(left, axis=(2, 3))[:, 0]))
-    return [(np.concatenate([t for t, _ in one]), np.concatenate([left for _, left in one])) for one in records]
+        records[-1].append(number)
+    left = tangent.fitted.residuals()
+    try:
+        smoothed = of_dynamics(tangent.fitted)
+    except InputError:
+        # Pieces of so few readings cannot be smoothed.
+        smoothed = []
+    found = []
+    for numbers in records:
+        times = np.concatenate([paths[k].record.times for k in numbers])
+        readings = np.mean(np.concatenate([left[k][:, 0] for k in numbers]), axis=-1)
+        if not smoothed:
+            found.append((times, [readings]))
+            continue
+        whole = np.concatenate([np.nan_to_num(smoothed[k].left) for k in numbers])
+        terms = np.concatenate([forces(paths[k])[:, :: paths[k].steps] for k in numbers], axis=1).reshape(
+            -1, whole.size
+        )
+        missing = (whole.ravel() - terms.T @ np.linalg.lstsq(terms.T, whole.ravel(), rcond=None)[0]).reshape(
+            whole.shape
+        )
+        moving = paths[numbers[0]].record.stretches.dynamics.moving
+        field = np.concatenate([paths[k].field[:: paths[k].steps, 0][..., moving] for k in numbers])
+        if paths[0].is_complex:
+            product = (field[:, 0] - 1j * field[:, 1]) * (missing[:, 0] + 1j * missing[:, 1])
+            times_field = np.stack([product.real, product.imag], axis=1)
+        else:
+            times_field = field * missing
+        shown = [np.concatenate([left[k][:, 0] for k in numbers]), missing, times_field]
+        found.append(
+            (np.concatenate([paths[k].record.times for k in numbers]), [np.mean(one, axis=-1) for one in shown])
+        )
+    return found
 
 
 def _harmonic(tangent: Tangent, effect: Effect) -> list[Try | None]:
