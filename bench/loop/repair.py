@@ -281,7 +281,7 @@ def close(
             f"{data[0].source}: {before.count:.0f} readings are too few for {before.parameters:.0f} unknowns (the coefficients and each "
             "trajectory's start); give longer or more records"
         )
-    fitted = before
+    fitted, lost = before, not horizon.follows(before)
     rounds: list[Round] = []
     equal: list[tuple[str, ...]] = []
     doubted: _Doubted | None = None
@@ -297,7 +297,7 @@ def close(
             rounds.append(Round(tuple(_unfitted(findings))))
             break
         ranking = _contest(fitted, findings, watcher, lost=not horizon.follows(fitted))
-        best, margin = _chosen(ranking if horizon.follows(fitted) else _steady(ranking, horizon))
+        best, margin = _chosen(_steady(ranking, horizon) if lost else ranking)
         count = len(named)
         if best is None or best.fitted is None or best.p * count > FALSE_ALARM:
             rounds.append(Round(tuple(ranking)))
@@ -465,15 +465,18 @@ def _told(samples: Samples, step: int) -> float:
 
 
 def _steady(ranking: Sequence[Candidate], horizon: Horizon) -> list[Candidate]:
-    """Leave out what acts at its own frequency or time and does not find the readings again, if anything else was tried.
+    """Leave out what acts at its own frequency or time where that is no more than in step with the motion.
 
-    Where the readings are lost, a force in step with the motion can stand for nearly anything; but not for all of it.
+    Where the declared equation loses the readings, such a force can stand for nearly anything; but a term without a name does clearly better then, or it
+    does not find the readings again while something else was tried.
     """
-    kept = [
-        one for one in ranking
-        if one.finding.change.effect.acts not in TIMED or (one.fitted is not None and horizon.follows(one.fitted))
-    ]  # fmt: skip
-    return kept if any(one.finding.named and one.fitted is not None for one in kept) else list(ranking)
+
+    def timed(one: Candidate) -> bool:
+        return one.finding.change.effect.acts in TIMED
+
+    ahead = [one for one in ranking if not timed(one) or _rival(ranking, one)[1] <= max(BETTER, ROUGH * one.evidence)]
+    kept = [one for one in ahead if not timed(one) or (one.fitted is not None and horizon.follows(one.fitted))]
+    return kept if any(one.finding.named and one.fitted is not None for one in kept) else ahead
 
 
 def _exact(fitted: Fitted) -> bool:
