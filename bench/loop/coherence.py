@@ -1,4 +1,4 @@
-"""Whether anything at all is left: noise does not go on from sample to sample or from site to site, whatever else does.
+"""Whether anything at all is left: noise does not go on from sample to sample or from site to site, and has no reading far out.
 
 The residual r, in units of the noise and free of what the model can do, stands on its lattice of times and sites. With G a bell of some
 width in samples and some in sites, q = r G r / r r is larger than for noise where neighbours in the residual agree: a portmanteau test (Box
@@ -51,6 +51,18 @@ def coherence(tangent: Tangent, draw: np.random.Generator, surrogates: int = 200
     # Far out, where it matters, the widths are as good as independent, however alike they are near the middle.
     count = float(len(widths))
     return Finding(name, Change(Effect("unnamed", "0")), gain, 1, count, float(np.log(count)), named=False)
+
+
+def farthest(tangent: Tangent) -> Finding:
+    """Give the reading that is farthest out, in units of what is left of all; `Finding.rarity` says how rarely Gaussian noise has such a one."""
+    away = tangent.residual**2 * tangent.spare / np.sum(tangent.residual**2)
+    sites = np.concatenate([np.nonzero(path.weight > 0)[-1] for path in tangent.paths])
+    first = int(np.argmax(away))
+    count = float(len(away))
+    return Finding(
+        "single readings far out", Change(Effect("unnamed", "0"), site=int(sites[first])), float(away[first]), 1, count, float(np.log(count)),
+        named=False,
+    )  # fmt: skip
 
 
 def _agreement(

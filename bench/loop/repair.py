@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bench.loop.coherence import coherence
+from bench.loop.coherence import coherence, farthest
 from bench.loop.model import Change, Fitted, Model, carried, cut, first_fit, pace, refit, strengths, without
 from bench.loop.residual import (
     Forecast,
@@ -496,7 +496,10 @@ def significant(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 def _anything(fitted: Fitted, draw: np.random.Generator, surrogates: int) -> tuple[Finding, ...]:
     """Look for anything at all where nothing that has a form is significant."""
-    found = () if _exact(fitted) else (coherence(linearise(fitted), draw, surrogates),)
+    if _exact(fitted):
+        return ()
+    tangent = linearise(fitted)
+    found = (coherence(tangent, draw, surrogates), farthest(tangent))
     return tuple(one for one in found if one.p < FALSE_ALARM / 2)
 
 

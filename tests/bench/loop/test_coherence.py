@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import systems
-from bench.loop.coherence import coherence
+from bench.loop.coherence import coherence, farthest
 from bench.loop.model import Model, first_fit
 from bench.loop.repair import diagnose
 from bench.loop.specimen import make
@@ -55,6 +55,23 @@ def test_what_has_no_form_in_any_list_is_seen(shape, name):
     found = coherence(replace(tangent, residual=noise + 20 * column / np.linalg.norm(column)), np.random.default_rng(6))
     assert found.p < 1e-6
     assert name in found.name
+
+
+@pytest.mark.parametrize(("name", "missing"), [("phi4", 0.0), ("dnls", 0.1)])
+def test_a_reading_far_out_is_seen_at_its_site_and_those_of_noise_are_not(name, missing):
+    tangent = tangent_of(name, missing)
+    draws = surrogate_residuals(tangent, np.random.default_rng(1), 400).T
+    p = np.array([farthest(replace(tangent, residual=one)).p for one in draws])
+    assert all(np.mean(p < level) <= 1.5 * level + 0.01 for level in (0.02, 0.1, 0.3))
+    assert np.mean(p < 0.5) > 0.1
+    path = tangent.paths[0]
+    row = int(np.flatnonzero(path.weight[12, 0, 0] > 0)[3])
+    far = np.zeros(path.weight.shape)
+    far[12, 0, 0, row] = 8 / path.weight[12, 0, 0, row]
+    spike = tangent.new(path.free(path.rows(far[None])))[:, 0]
+    found = farthest(replace(tangent, residual=draws[0] + spike))
+    assert found.p < 1e-4
+    assert found.change.site == row
 
 
 def test_a_fault_that_no_term_comes_near_is_unexplained_all_the_same(monkeypatch):
