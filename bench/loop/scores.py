@@ -169,7 +169,7 @@ def confusion(frame: pd.DataFrame, least: float = 10.0) -> Figure:
         index=[*order, *(name for name in counts.index if name not in order)], columns=[*order, *rest]
     )
     share = counts.div(counts.sum(axis=1), axis=0).fillna(0.0)
-    figure = Figure(figsize=(11, 10.5), layout="constrained")
+    figure = Figure(figsize=(11, 3 + 0.2 * len(counts)), layout="constrained")
     axes = figure.add_subplot()
     axes.imshow(share.to_numpy(), cmap="Blues", vmin=0, vmax=1, aspect="auto")
     axes.set_xticks(np.arange(share.shape[1]), share.columns, rotation=90)
