@@ -175,10 +175,7 @@ def _records(tangent: Tangent) -> list[tuple[Float[ndarray, " time"], list[Float
             times_field = np.stack([product.real, product.imag], axis=1)
         else:
             times_field = field * missing
-        shown = [np.concatenate([left[k][:, 0] for k in numbers]), missing, times_field]
-        found.append(
-            (np.concatenate([paths[k].record.times for k in numbers]), [np.mean(one, axis=-1) for one in shown])
-        )
+        found.append((times, [readings, np.mean(missing, axis=-1), np.mean(times_field, axis=-1)]))
     return found
 
 
