@@ -2,7 +2,8 @@
 
 - Readings that are wrong by any smooth function of the field: a scale that is bent, a range that ends; or by one of its rate: a needle that sticks.
 - Readings in which those of the neighbours are mixed, or the hum of something else.
-- Readings that are all scaled or lifted alike, by another amount at each time.
+- Readings that are all scaled or lifted alike, by another amount at each time; or by an amount that changes smoothly along the chain, as
+  sensors that are each a little off do not.
 - Readings that come late, one site's or each by its own; one site's that are wrong by any course in time.
 - Patterns in space and time of what is left: nets for whatever else there is.
 
@@ -30,12 +31,14 @@ if TYPE_CHECKING:
 # Of the field's own size: a step for derivatives of a function of it.
 STEP = 1e-4
 BANDS = ((0, 4), (4, 12))
+# Of fewer sites nobody can say that they follow a smooth course.
+FEWEST_SITES = 6
 CHANGE = Change(Effect("unnamed", "0"))
 
 
 def misreadings(tangent: Tangent) -> list[Group]:
     """List all of them by what they are called in a ranking."""
-    kinds = (_bent, _sticky, _mixed, _hums, _flickering, _late, _courses, _patterns)
+    kinds = (_bent, _sticky, _mixed, _hums, _flickering, _slanted, _late, _courses, _patterns)
     return [found for kind in kinds for found in kind(tangent)]
 
 
@@ -162,6 +165,27 @@ def _flickering(tangent: Tangent) -> list[Group]:
     return [
         *group("readings scaled at each time by its own", _law(tangent, scaled, random=True)),
         *group("readings lifted at each time by its own", _law(tangent, lifted, random=True)[:1]),
+    ]
+
+
+def _slanted(tangent: Tangent) -> list[Group]:
+    """Give readings scaled or lifted by an amount that changes smoothly along the chain; long half waves are likelier."""
+    sites = tangent.paths[0].record.stretches.dynamics.sites
+    if sites < FEWEST_SITES:
+        return []
+    # Every half wave, as the slopes at a smooth course's ends make them fall off: by their number squared.
+    numbers, place = np.arange(sites)[:, None], (np.arange(sites) + 0.5) / sites
+    profiles = np.cos(np.pi * numbers * place) / np.maximum(numbers, 1) ** 2
+
+    def scaled(_path: Path, u: ndarray) -> ndarray:
+        return np.asarray(profiles[:, None] * u)
+
+    def lifted(path: Path, u: ndarray) -> ndarray:
+        return scaled(path, np.ones_like(u))
+
+    return [
+        *group("readings scaled by a smooth course along the chain", _law(tangent, scaled, random=True)),
+        *group("readings lifted by a smooth course along the chain", _law(tangent, lifted, random=True)[:1]),
     ]
 
 

@@ -43,6 +43,8 @@ FALSE_ALARM = 0.004
 EQUAL = 3.0
 # So much better must a term without a name be before no name is given; twice as good where a model loses the readings.
 BETTER = 5.0
+# What sensors' offsets are called that only forces can be.
+FORCES = "a constant force of its own at each site"
 # Terms without a name that are fitted in full beside the names in a round, and what share of their evidence in the screen they must have: what
 # is far off the declared equation is screened roughly.
 OTHER_FITS, OTHER_SHARE = 4, 0.6
@@ -337,6 +339,8 @@ def close(
         left = significant([one.finding for one in rounds[0].ranking])
     if not fitted.model.changes:
         rival = None
+    elif rival is None and horizon.follows(fitted):
+        rival = _forced(fitted)
     verdict = (
         ("partly explained" if left or rival or _repeated(fitted) else "explained")
         if fitted.model.changes
@@ -626,19 +630,31 @@ def polish(model: Model, start: Fitted) -> Fitted | None:
 def settled(fitted: Fitted) -> Fitted:
     """Write offsets that were found as forces as offsets, where that fits as well."""
     for number, change in enumerate(fitted.model.changes):
-        if not change.as_force:
-            continue
-        rest = _rest(fitted)
-        if rest is None:
-            continue
-        smaller = without(fitted, number)
-        psi = dict(zip(change.psi, (float(x) for x in rest), strict=True))
-        changes = list(fitted.model.changes)
-        changes[number] = replace(change, as_force=False, psi=psi)
-        other = polish(replace(fitted.model, changes=tuple(changes)), smaller)
+        other = _as_offset(fitted, number) if change.as_force else None
         if other is not None and other.gain(fitted) > -EQUAL:
             fitted = other
     return fitted
+
+
+def _as_offset(fitted: Fitted, number: int) -> Fitted | None:
+    """Fit a change that is written as forces as offsets; None where it cannot be."""
+    change, rest = fitted.model.changes[number], _rest(fitted)
+    if rest is None:
+        return None
+    smaller = without(fitted, number)
+    psi = dict(zip(change.psi, (float(x) for x in rest), strict=True))
+    changes = list(fitted.model.changes)
+    changes[number] = replace(change, as_force=False, psi=psi)
+    return polish(replace(fitted.model, changes=tuple(changes)), smaller)
+
+
+def _forced(fitted: Fitted) -> tuple[str, float] | None:
+    """Say by how much forces do better than the offsets that they are called: by so much no sensor is off."""
+    for number, change in enumerate(fitted.model.changes):
+        other = _as_offset(fitted, number) if change.as_force else None
+        if other is not None and fitted.gain(other) > 2 * BETTER:
+            return FORCES, fitted.gain(other) / 2
+    return None
 
 
 def _rest(fitted: Fitted) -> ndarray | None:

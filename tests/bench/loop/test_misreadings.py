@@ -66,6 +66,15 @@ def scanned(u, rate):
     return rate * np.arange(u.shape[-1]), 0 * u
 
 
+def tilted(u, rate):
+    slant = np.linspace(-1, 1, u.shape[-1])
+    return slant * u, slant * rate
+
+
+def heaved(u, _rate):
+    return np.linspace(-1, 1, u.shape[-1]) ** 2 * np.ones_like(u), 0 * u
+
+
 @pytest.mark.parametrize("name", ["phi4", "ginzburg-landau"])
 @pytest.mark.parametrize(
     ("fault", "found", "site"),
@@ -75,6 +84,8 @@ def scanned(u, rate):
         (flickering, "readings scaled at each time by its own", None),
         (lifted, "readings lifted at each time by its own", None),
         (scanned, "readings late, each site's by its own", None),
+        (tilted, "readings scaled by a smooth course along the chain", None),
+        (heaved, "readings lifted by a smooth course along the chain", None),
         (clipped, "readings wrong by a function of the field", None),
         (mixed, "readings mixed with the neighbours'", None),
         (late, "one site's readings late", 3),
@@ -92,6 +103,25 @@ def test_a_fault_of_an_instrument_is_found_as_what_it_is(name, fault, found, sit
     first = screen(faulty, CATALOGUE, np.random.default_rng(0), 40)[0]
     assert first.name == found
     assert first.change.site == site
+
+
+def test_sensors_that_are_each_a_little_off_follow_no_smooth_course():
+    """Scales of 25 sensors without a pattern are the sensors' own, and those of a slant are not."""
+    system = systems.find("phi4")
+    one = make(system, "none", 0.0, np.random.default_rng(4), variation=True)
+    data = [replace(one.samples.observed(), ends=system.ends)]
+    tangent = linearise(first_fit(Model(system.library("equation"), system.order), data))
+    path = tangent.paths[0]
+    field = path.field[:: path.steps]
+    smooth = "readings scaled by a smooth course along the chain"
+    for scales, first in (
+        (np.random.default_rng(3).normal(size=25), "sensor-gain"), (np.linspace(-1, 1, 25), smooth),
+    ):  # fmt: skip
+        column = tangent.new(path.free(path.rows((scales * field)[None])))[:, 0]
+        faulty = replace(tangent, residual=tangent.residual + 20 * column / np.linalg.norm(column))
+        found = {one.name: one.evidence for one in screen(faulty, CATALOGUE, np.random.default_rng(0), 40)}
+        assert max(found, key=lambda name: found[name]) == first
+        assert abs(found[smooth] - found["sensor-gain"]) > 5
 
 
 def test_velocities_are_the_slopes_of_what_the_field_is_read_as(monkeypatch):

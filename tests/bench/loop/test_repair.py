@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 
 import systems
 from bench.loop.model import Model
-from bench.loop.repair import close, diagnose
+from bench.loop.repair import FORCES, close, diagnose
 from bench.loop.residual import over_noise
 from bench.loop.specimen import make
 from systems.effects import CATALOGUE
@@ -135,6 +135,17 @@ def test_what_is_outside_the_catalogue_gets_no_wrong_name(name, effect):
     assert course.verdict in ("unexplained", "partly explained")
     assert course.left
     assert over_noise(course.after, sigma) > 1.1
+
+
+def test_forces_that_no_offset_of_a_sensor_makes_are_not_the_sensors():
+    """Where the chain is not linear, a push at each site is another thing than a reading that is lifted."""
+    _, pushed, _ = looped("sine-gordon", "other: uneven-floor", sites=15)
+    assert pushed.verdict == "partly explained"
+    assert pushed.rival is not None
+    assert pushed.rival[0] == FORCES
+    _, lifted, _ = looped("sine-gordon", "sensor-offset", sites=15)
+    assert names(lifted) == ["sensor-offset"]
+    assert (lifted.verdict, lifted.rival) == ("explained", None)
 
 
 def test_dry_friction_is_named_and_fitted_to_the_end_though_its_sign_jumps():
