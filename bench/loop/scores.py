@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from bench.loop.faults import BLIND, FOURTH_BLIND, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND
+from bench.loop.faults import BLIND, FIFTH_BLIND, FOURTH_BLIND, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND
 from bench.loop.trial import is_right
 from bench.provenance import lines
 from bench.tables import format_number
@@ -74,7 +74,7 @@ def kind(effect: str, apart: float) -> str:
     if effect in OTHERS:
         sets = {
             "blind set, ": BLIND, "second blind set, ": SECOND_BLIND, "third blind set, ": THIRD_BLIND,
-            "fourth blind set, ": FOURTH_BLIND,
+            "fourth blind set, ": FOURTH_BLIND, "fifth blind set, ": FIFTH_BLIND,
         }  # fmt: skip
         outside = "outside the catalogue, " + next((text for text, names in sets.items() if effect in names), "")
         return outside + (f"{APART:g} or more from it" if apart >= APART else f"less than {APART:g} from it")

@@ -3,7 +3,7 @@
 A suite file (TOML) has a `title` and any number of tables
 
     [[made]]                       # every combination of the lists is a trial
-    effects = ["catalogue"]        # names; "catalogue": all that make sense; "outside", "blind", "second-blind", "third-blind", "fourth-blind": faults that are none of it; "none"; "a+b": two at once
+    effects = ["catalogue"]        # names; "catalogue": all that make sense; "outside", "blind", "second-blind", "third-blind", "fourth-blind", "fifth-blind": faults that are none of it; "none"; "a+b": two at once
     systems = ["phi4"]
     noise = [0.01]
     z = [5, 10, 30]
@@ -63,6 +63,7 @@ KNOWN = tuple(effect.name for effect in CATALOGUE)
 GROUPS = {
     "catalogue": KNOWN, "outside": tuple(faults.OTHERS), "blind": tuple(faults.BLIND), "second-blind": tuple(faults.SECOND_BLIND),
     "third-blind": tuple(faults.THIRD_BLIND), "fourth-blind": tuple(faults.FOURTH_BLIND),
+    "fifth-blind": tuple(faults.FIFTH_BLIND),
 }  # fmt: skip
 
 

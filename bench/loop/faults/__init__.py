@@ -1,13 +1,13 @@
 """What may be wrong with a chain or with the instrument: faults that recordings are made with, to see whether the loop finds them.
 
 They are made apart from the loop: plain NumPy forces beside the system's own right-hand side, SciPy's integrators, and the instrument's
-faults put on afterwards. Four sets from outside the catalogue are blind: whoever made them had not looked at how the diagnosis works.
+faults put on afterwards. Five sets from outside the catalogue are blind: whoever made them had not looked at how the diagnosis works.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -63,6 +63,9 @@ SECOND_ORDER = (
     "other: bent-damper",
     # For order 1, where a brake would be loss in proportion to u, this is a defect.
     "other: braked-site",
+    # For order 1 this would be disorder, and the next one asymmetric coupling.
+    "other: absorbing-ends",
+    "other: gyroscopic-bonds",
 )
 COMPLEX = ("other: phase-conjugation", "other: nonlocal-response")
 REAL = ("damping", "nonlinear-loss", "gain-loss", "disorder")
@@ -122,7 +125,22 @@ FOURTH_BLIND = {
     "other: stray-spikes": _misread(instrument.spiked),
     "other: ac-coupling": _misread(instrument.blocked),
 }
-OTHERS = {**_pushing(pushes.PLAIN), **BLIND, **SECOND_BLIND, **THIRD_BLIND, **FOURTH_BLIND}
+FIFTH_BLIND = {
+    **_pushing(pushes.FIFTH_BLIND),
+    "other: viscoelastic-bonds": Fault(unseen.viscoelastic_bonds),
+    "other: fatiguing-bonds": Fault(unseen.fatiguing_bonds),
+    "other: holding-loop": Fault(unseen.holding_loop),
+    "other: parallel-chain": Fault(unseen.parallel_chain),
+    "other: bent-wire": Fault(unseen.bent_wire, "second order"),
+    "other: converter-residue": _misread(instrument.residue),
+    "other: cyclic-error": _misread(instrument.cyclic),
+    "other: auto-exposure": _misread(instrument.exposed),
+    "other: wandering-reference": _misread(instrument.wandering),
+    "other: two-cards": _misread(instrument.two_cards),
+    "other: mixer-imbalance": replace(_misread(instrument.unbalanced), only="complex"),
+    "other: resampled-rows": _misread(instrument.resampled),
+}
+OTHERS = {**_pushing(pushes.PLAIN), **BLIND, **SECOND_BLIND, **THIRD_BLIND, **FOURTH_BLIND, **FIFTH_BLIND}
 FAULTS = {**CATALOGUED, **OTHERS}
 
 
@@ -143,6 +161,7 @@ def sensible(name: str, system: System) -> bool:
 __all__ = [
     "BLIND",
     "FAULTS",
+    "FIFTH_BLIND",
     "FOURTH_BLIND",
     "NONE",
     "OTHERS",

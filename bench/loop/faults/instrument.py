@@ -170,6 +170,84 @@ def blocked(setting: Setting, size: float) -> Fields:
     return shown[::FINE], None if v is None else v[::FINE]
 
 
+def residue(setting: Setting, size: float) -> Fields:
+    """Scan all sites, row by row, with one converter that keeps a share of what it read before: y = (1 - size) u + size y_before.
+
+    Before the first site of a row it has read the last one of the row before.
+    """
+    u, v = setting.run()
+    return _kept(u, size), None if v is None else _kept(v, size)
+
+
+def cyclic(setting: Setting, size: float) -> Fields:
+    """Read u with an interferometer or a grating, whose error repeats with its fringes: u + size sin(2 pi u / cycle)."""
+    u, v = setting.run()
+    turn = 2 * np.pi / float(setting.drawn.about["cycle"])
+    if np.iscomplexobj(u):
+        return u + size * (np.sin(turn * u.real) + 1j * np.sin(turn * u.imag)), v
+    return u + size * np.sin(turn * u), v
+
+
+def exposed(setting: Setting, size: float) -> Fields:
+    """Let a camera for u set its own exposure, from the mean b of |u| in the row before: u (1 - size (b / b_first - 1))."""
+    u, v = setting.run()
+    bright = np.mean(np.abs(u), axis=1)
+    # The first row is exposed as it should be.
+    before = np.concatenate([bright[:1], bright[:-1]])
+    return u * (1 - size * (before / bright[0] - 1))[:, None], v
+
+
+def wandering(setting: Setting, size: float) -> Fields:
+    """Let the reference that all sensors of u are read against wander at random, by small steps."""
+    u, v = setting.run()
+    step = size * setting.drawn.wander[:, None]
+    return u + (step * (1 + 1j) if np.iscomplexobj(u) else step), v
+
+
+def two_cards(setting: Setting, size: float) -> Fields:
+    """Read the right half with a second card whose clock is slow: its rows are taken at t + size (t - t_first)."""
+    times, half = setting.times, setting.chain.sites // 2
+    at = np.stack([times, times + size * (times - times[0])])
+    grid, place = np.unique(at, return_inverse=True)
+    u, v = setting.at(grid).run()
+    first, second = place.reshape(at.shape)
+
+    def joined(field: ndarray) -> ndarray:
+        return np.concatenate([field[first, :half], field[second, half:]], axis=1)
+
+    return joined(u), None if v is None else joined(v)
+
+
+def unbalanced(setting: Setting, size: float) -> Fields:
+    """Read a complex field with two mixers that are not alike in gain, so that its mirror image appears: u + size conj(u)."""
+    u, v = setting.run()
+    return u + size * np.conj(u), None if v is None else v + size * np.conj(v)
+
+
+def resampled(setting: Setting, size: float) -> Fields:
+    """Take rows in steps of a recorder's own, the root of size, and put the samples' times on straight lines between them."""
+    # The root, as straight lines miss a curve by the square of the step.
+    step, times = float(np.sqrt(size)), setting.times
+    place = (times - times[0]) / step
+    before = np.floor(place)
+    share = (place - before)[:, None]
+    grid, rows = np.unique(times[0] + step * np.stack([before, before + 1]), return_inverse=True)
+    u, v = setting.at(grid).run()
+    left, right = rows.reshape(2, -1)
+
+    def straight(field: ndarray) -> ndarray:
+        return np.asarray((1 - share) * field[left] + share * field[right])
+
+    return straight(u), None if v is None else straight(v)
+
+
+def _kept(field: ndarray, size: float) -> ndarray:
+    shown = field.ravel().copy()
+    for k in range(1, len(shown)):
+        shown[k] = (1 - size) * shown[k] + size * shown[k - 1]
+    return shown.reshape(field.shape)
+
+
 def _lowered(field: ndarray, size: float) -> ndarray:
     return np.asarray(field - size * np.mean(field, axis=1, keepdims=True))
 

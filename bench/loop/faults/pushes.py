@@ -86,6 +86,23 @@ class Moment:
         omegas, phases = self.drawn.supply
         return float(np.sum(np.cos(omegas * self.t + phases)))
 
+    def ticks(self) -> float:
+        """Give bells half as wide as the pulse, one of them where it is, that come again and again at equal times."""
+        about = self.drawn.about
+        late = (self.t - about["at"]) / about["ticking"]
+        # The nearest one and those beside it: others are too far away to be felt.
+        away = (late - np.round(late) + np.arange(-2, 3)) * about["ticking"]
+        return float(np.sum(np.exp(-((2 * away / about["width"]) ** 2) / 2)))
+
+    def two_level(self) -> float:
+        """Give +1 or -1, the state of something that switches to and fro at drawn times."""
+        return float((-1.0) ** np.sum(self.drawn.switches < self.t))
+
+    def sponge(self) -> ndarray:
+        """Give how much of an absorber is at each site: 1 at both ends, less by exp(-distance / breadth) within."""
+        n = np.abs(self.drawn.n)
+        return np.asarray(np.exp((n - np.max(n)) / self.drawn.about["breadth"]))
+
 
 def between(m: Moment) -> ndarray:
     """Give the velocities' second difference."""
@@ -97,6 +114,12 @@ def steepening(m: Moment) -> ndarray:
     """Give the slope of the field's cube, which moves high parts of a wave faster than low ones."""
     cubes = replace(m, u=np.abs(m.u) ** 2 * m.u)
     return np.asarray((cubes.neighbour(1) - cubes.neighbour(-1)) / 2)
+
+
+def gyroscopic(m: Moment) -> ndarray:
+    """Give half the difference of the neighbours' velocities, as spinning tops in the bonds or servos that act to one side make it."""
+    velocities = replace(m, u=m.v)
+    return np.asarray((velocities.neighbour(1) - velocities.neighbour(-1)) / 2)
 
 
 # By the catalogue's names.
@@ -172,7 +195,21 @@ FOURTH_BLIND: dict[str, Callable[[Moment], ndarray]] = {
     "other: self-steepening": steepening,
 }
 
-PUSHES = {**CATALOGUED, **PLAIN, **FIRST_BLIND, **SECOND_BLIND, **THIRD_BLIND, **FOURTH_BLIND}
+FIFTH_BLIND: dict[str, Callable[[Moment], ndarray]] = {
+    # Foam, or a lossy taper, at both ends.
+    "other: absorbing-ends": lambda m: -m.sponge() * m.v,
+    # Steps and traffic that shake the table: many frequencies, all sites alike.
+    "other: rumbling-floor": lambda m: m.supply() * np.ones(len(m.u)),
+    # A pump or a stepping motor near by.
+    "other: ticking-pump": lambda m: m.ticks() * np.ones(len(m.u)),
+    "other: gyroscopic-bonds": gyroscopic,
+    # Junctions or oscillators in series with one load: each feels the mean of all.
+    "other: shared-load": lambda m: -np.mean(m.v) * np.ones(len(m.u)),
+    # A charge trap, or a loose contact, beside one site: random telegraph noise of its stiffness.
+    "other: two-level-defect": lambda m: m.two_level() * np.eye(len(m.u))[m.drawn.site] * m.u,
+}
+
+PUSHES = {**CATALOGUED, **PLAIN, **FIRST_BLIND, **SECOND_BLIND, **THIRD_BLIND, **FOURTH_BLIND, **FIFTH_BLIND}
 
 
 def push(setting: Setting, amounts: dict[str, complex]) -> Push:

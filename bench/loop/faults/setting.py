@@ -42,6 +42,8 @@ class Drawn:
         supply: frequencies and phases of an unsteady supply (2, 5).
         flicker: how much brighter than usual each row is lit (T,).
         spikes: by how much each reading is off, 0 for nearly all of them (T, N).
+        switches: the times at which something with two states changes from one to the other, in order (6,).
+        wander: how far a reference has gone from where it was at the first row (T,).
     """
 
     about: Mapping[str, float]
@@ -60,6 +62,8 @@ class Drawn:
     supply: Float[ndarray, "two waves"]
     flicker: Float[ndarray, " time"]
     spikes: Float[ndarray, "time sites"]
+    switches: Float[ndarray, " switches"]
+    wander: Float[ndarray, " time"]
 
     @property
     def site(self) -> int:
@@ -160,7 +164,9 @@ def draw_all(name: str, sites: int, times: ndarray, draw: np.random.Generator) -
     moving one, frequency `own` of a resonator, `warming`, a sensor's time; `wire_from` and `wire_to`, the sites at the ends of a wire,
     `grip`, the most that a slipping spring is bent, `cooling`, the time in which heat goes, `fading` length of a response, `hum` and
     `hum_phase`, frequency and phase of the mains; `play`, how far a site goes before it meets a stop, `sway`, frequency of a mount; `sweep`,
-    by how much a drive's frequency rises in a unit of time.
+    by how much a drive's frequency rises in a unit of time; `ticking`, the time between two ticks, `relaxing`, the time in which a stretched
+    bond gives way, `cycle`, the way after which a sensor's error repeats itself, `aside`, by how many sites something is moved
+    along the chain. All are dimensionless.
     """
     span = float(times[-1] - times[0])
     n = np.arange(sites) - (sites - 1) / 2
@@ -220,7 +226,15 @@ def draw_all(name: str, sites: int, times: ndarray, draw: np.random.Generator) -
     hits = more.choice(len(times) * sites, size=max(len(times) * sites // 100, 3), replace=False)
     spikes = np.zeros((len(times), sites))
     spikes.flat[hits] = more.choice([-1.0, 1.0], size=len(hits)) * more.uniform(0.5, 1.5, size=len(hits))
+    about |= {
+        "ticking": span * more.uniform(0.15, 0.3),
+        "relaxing": span * more.uniform(0.1, 0.4),
+        "cycle": more.uniform(0.3, 0.8),
+        "aside": int(more.choice([-1, 1]) * more.integers(2, 5)),
+    }
+    switches = float(times[0]) + span * np.sort(more.uniform(0.05, 0.95, size=6))
+    wander = np.append(0.0, np.cumsum(more.normal(size=len(times) - 1))) / np.sqrt(len(times))
     return Drawn(
         about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force, near, pickup,
-        supply, flicker, spikes,
+        supply, flicker, spikes, switches, wander,
     )  # fmt: skip

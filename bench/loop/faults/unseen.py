@@ -92,6 +92,71 @@ def end_stops(setting: Setting, amount: complex) -> Fields:
     return setting.run(stopped)
 
 
+def viscoelastic_bonds(setting: Setting, amount: complex) -> Fields:
+    """Couple neighbours by rubber, too, that gives way: amount times the second difference of u - w, where w' = (u - w) / relaxing.
+
+    It is relaxed at the start.
+    """
+    chain, drawn, relaxing = setting.chain, setting.drawn, float(setting.drawn.about["relaxing"])
+
+    def both(_t: float, rest: ndarray, u: ndarray, _v: ndarray) -> tuple[ndarray, ndarray]:
+        left = u - rest
+        moment = Moment(0.0, left, left, chain, drawn)
+        return amount * (moment.stretch(1) + moment.stretch(-1)), left / relaxing
+
+    return _with_unseen(setting, chain.unpack(setting.start)[0], both)
+
+
+def fatiguing_bonds(setting: Setting, amount: complex) -> Fields:
+    """Let each bond weaken by amount d, where d' is the square of its stretch: what it has borne so far, and it does not recover."""
+
+    def both(_t: float, borne: ndarray, u: ndarray, _v: ndarray) -> tuple[ndarray, ndarray]:
+        stretch = np.diff(u)
+        lost = np.pad(borne * stretch, 1)
+        return -amount * np.diff(lost), np.abs(stretch) ** 2
+
+    return _with_unseen(setting, np.zeros(setting.chain.sites - 1), both)
+
+
+def holding_loop(setting: Setting, amount: complex) -> Fields:
+    """Let a servo hold the mean m of all sites where it was: it pushes all alike by -amount times the integral of m(t) - m(0)."""
+    held = np.mean(setting.chain.unpack(setting.start)[0])
+
+    def both(_t: float, summed: ndarray, u: ndarray, _v: ndarray) -> tuple[ndarray, ndarray]:
+        return np.asarray(-amount * summed * np.ones(len(u))), np.full(1, np.mean(u) - held)
+
+    return _with_unseen(setting, np.zeros(1, np.asarray(held).dtype), both)
+
+
+def parallel_chain(setting: Setting, amount: complex) -> Fields:
+    """Let a second chain like this one lie beside it, out of sight: sites w opposite each other pull by amount (w - u), amount (u - w).
+
+    It starts as this one does, moved along by a few sites.
+    """
+    chain = setting.chain
+    rate, size = chain.right_hand_side, chain.parts * chain.sites
+    moved = np.clip(np.arange(chain.sites) + int(setting.drawn.about["aside"]), 0, chain.sites - 1)
+    u0, v0 = chain.unpack(setting.start)
+
+    def both(t: float, beside: ndarray, u: ndarray, _v: ndarray) -> tuple[ndarray, ndarray]:
+        pull, change = amount * (chain.unpack(beside)[0] - u), rate(t, beside)
+        change[-size:] -= setting.parts(pull)
+        return pull, change
+
+    return _with_unseen(setting, chain.pack(u0[moved], None if v0 is None else v0[moved]), both)
+
+
+def bent_wire(setting: Setting, amount: complex) -> Fields:
+    """Thread each site like a bead on a bent wire, so that its inertia grows away from 0: (1 + amount u^2) u'' + amount u u'^2 = F."""
+    bent = float(np.real(amount))
+
+    def push(t: float, u: ndarray, v: ndarray) -> ndarray:
+        own = setting.own_rate(t, u, v)
+        return np.asarray((own - bent * u * v**2) / (1 + bent * u**2) - own)
+
+    return setting.run(push)
+
+
 def ends(setting: Setting, _amount: complex) -> Fields:
     """Give the chain the ends that it is not declared to have."""
     return setting.other_ends().run()
@@ -129,17 +194,31 @@ def _with_hidden(
 
     The push is given h and u; the rate at which h changes follows from h and v (u for order 1).
     """
+
+    def both(_t: float, hidden: ndarray, u: ndarray, v: ndarray) -> tuple[ndarray, ndarray]:
+        return push(hidden, u), change(hidden, v)
+
+    return _with_unseen(setting, np.zeros(setting.chain.sites), both)
+
+
+def _with_unseen(
+    setting: Setting, begin: ndarray, both: Callable[[float, ndarray, ndarray, ndarray], tuple[ndarray, ndarray]]
+) -> Fields:
+    """Integrate with unseen numbers h, real ones or complex ones as they are at the start.
+
+    The push of the sites, and the rates at which these numbers change, follow from t, h, u and v (u for order 1).
+    """
     chain = setting.chain
-    rate, size, sites = chain.right_hand_side, chain.parts * chain.sites, chain.sites
+    rate, size, own = chain.right_hand_side, chain.parts * chain.sites, len(setting.start)
 
     def coupled(t: float, y: ndarray) -> ndarray:
-        rates, hidden = rate(t, y[:-sites]), y[-sites:]
-        u, v = chain.unpack(y[:-sites])
-        rates[-size:] += setting.parts(push(hidden, u))
-        return np.concatenate([rates, change(hidden, u if v is None else v)])
+        rates, (u, v) = rate(t, y[:own]), chain.unpack(y[:own])
+        force, change = both(t, y[own:].view(begin.dtype), u, u if v is None else v)
+        rates[-size:] += setting.parts(force)
+        return np.concatenate([rates, change.view(float)])
 
-    start = np.concatenate([setting.start, np.zeros(sites)])
-    return chain.unpack(integrated(coupled, start, setting.times)[:-sites])
+    start = np.concatenate([setting.start, begin.view(float)])
+    return chain.unpack(integrated(coupled, start, setting.times)[:own])
 
 
 def _with_past(setting: Setting, late: Callable[[ndarray, ndarray], ndarray]) -> Fields:

@@ -9,9 +9,20 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 
 import systems
-from bench.loop.faults import BLIND, FAULTS, FOURTH_BLIND, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND, sensible
+from bench.loop.faults import (
+    BLIND,
+    FAULTS,
+    FIFTH_BLIND,
+    FOURTH_BLIND,
+    NONE,
+    OTHERS,
+    SECOND_BLIND,
+    THIRD_BLIND,
+    sensible,
+)
 from bench.loop.model import Model, first_fit
 from bench.loop.specimen import make
 from systems.effects import CATALOGUE
@@ -36,6 +47,8 @@ SOME = [
     ("phi4", "other: slow-sensor"), ("dnls", "other: side-resonator"), ("dnls", "other: retarded-coupling"),
     ("phi4", "other: slipping-spring"), ("dnls", "other: slow-heating"), ("dnls", "other: scanned-channels"),
     ("phi4", "other: mains-hum"), ("dnls", "other: inner-resonators"), ("phi4", "other: stray-spikes"),
+    ("phi4", "other: two-level-defect"), ("dnls", "other: parallel-chain"), ("phi4", "other: wandering-reference"),
+    ("dnls", "other: resampled-rows"),
 ]  # fmt: skip
 
 
@@ -121,6 +134,12 @@ def rising(about, t):
     return np.cos(about["phase"] + np.trapezoid(about["omega"] + about["sweep"] * s, s))
 
 
+def ticking(about, t):
+    """Bells at all times that are whole numbers of ticks away from the first."""
+    middles = about["at"] + about["ticking"] * np.arange(-20, 21)
+    return np.sum(np.exp(-0.5 * ((t - middles) / (about["width"] / 2)) ** 2))
+
+
 def truth_of(name):
     """The declared equation's true coefficients."""
     system = systems.find(name)
@@ -133,7 +152,8 @@ def truth_of(name):
         "damping", "drive", "defect", "next-neighbour", "unequal-masses", "gradient", "other: lopsided-bonds", "other: moving-spot",
         "other: plane-wave", "other: stray-wire", "other: pumped-coupling", "other: shaken-end", "other: three-body",
         "other: bent-damper", "other: end-stops", "other: sweeping-drive", "other: braked-site", "other: tapped-site",
-        "other: one-way-bond", "other: self-steepening",
+        "other: one-way-bond", "other: self-steepening", "other: absorbing-ends", "other: gyroscopic-bonds", "other: shared-load",
+        "other: ticking-pump",
     ],
 )  # fmt: skip
 def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
@@ -176,6 +196,10 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
         "other: tapped-site": lambda t, _u, _v: at * np.exp(-0.5 * ((t - about["at"]) / about["width"]) ** 2),
         "other: one-way-bond": lambda _t, u, _v: at * np.diff(u, append=u[-1]),
         "other: self-steepening": lambda _t, u, _v: (np.append(u[1:], u[-1]) ** 3 - np.append(u[0], u[:-1]) ** 3) / 2,
+        "other: absorbing-ends": lambda _t, _u, v: -np.exp(-np.array([0, 1, 2, 3, 2, 1, 0]) / about["breadth"]) * v,
+        "other: gyroscopic-bonds": lambda _t, _u, v: (np.append(v[1:], v[-1]) - np.append(v[0], v[:-1])) / 2,
+        "other: shared-load": lambda _t, _u, v: -np.full(7, np.sum(v) / 7),
+        "other: ticking-pump": lambda t, _u, _v: np.full(7, ticking(about, t)),
     }
     begin = one.clean.u[0]
 
@@ -198,7 +222,7 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
         ("nonlinear-loss", -1), ("asymmetric-coupling", 1), ("other: phase-conjugation", 1), ("other: plane-wave", 1),
         ("other: stray-wire", 1), ("other: nonlocal-response", 1), ("other: pumped-coupling", 1), ("other: three-body", 1),
         ("other: end-stops", -1), ("other: sweeping-drive", 1), ("other: tapped-site", 1), ("other: one-way-bond", 1),
-        ("other: self-steepening", 1),
+        ("other: self-steepening", 1), ("other: shared-load", -1), ("other: ticking-pump", 1),
     ],
 )  # fmt: skip
 def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
@@ -232,6 +256,8 @@ def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
         "other: self-steepening": lambda _, u: np.convolve(
             np.pad(u * u * u.conj(), 1, "edge"), [0.5, 0, -0.5], "valid"
         ),
+        "other: shared-load": lambda _, u: np.full(7, np.sum(u) / 7),
+        "other: ticking-pump": lambda t, _: np.full(7, ticking(about, t)),
     }
     begin = one.clean.u[0]
 
@@ -450,6 +476,141 @@ def test_bonds_that_share_inertia_feel_how_neighbours_accelerate(name):
     assert np.max(np.abs(left)) < 0.01 * np.max(np.abs(missing))
 
 
+def missing(name, effect):
+    """A dense recording, and what its sites are pushed by beside the declared equation's forces, at each of its times."""
+    one = drawn(name, effect, z=40, noise=0.05, samples=150)
+    t, u = one.clean.t, one.clean.u
+    xi = truth_of(name)
+    beside = np.array([neighbours(row) - 2 * row for row in u])
+    if name == "dnls":
+        return one, CubicSpline(t, u)(t, 1) - 1j * xi[0] * beside - 1j * xi[1] * np.abs(u) ** 2 * u
+    return one, CubicSpline(t, one.clean.v)(t, 1) - xi[0] * beside - xi[1] * u - xi[2] * u**3
+
+
+# Splines are least sure at the ends of a recording.
+INSIDE = slice(10, -10)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_floor_that_rumbles_shakes_all_sites_alike_at_five_frequencies(name):
+    one, force = missing(name, "other: rumbling-floor")
+    shaken = np.mean(force, axis=1)[INSIDE] / one.amount
+    assert np.max(np.abs(force[INSIDE] / one.amount - shaken[:, None])) < 0.01 * np.max(np.abs(shaken))
+    assert np.max(np.abs(np.imag(shaken))) < 0.01 * np.max(np.abs(shaken))
+    assert 1 < np.max(np.abs(shaken)) < 5
+    # Five waves obey a recurrence over ten equal steps, the same forwards and backwards: five numbers, found here from twice as many rows.
+    rows = np.lib.stride_tricks.sliding_window_view(np.real(shaken), 71)[:, ::7]
+    beside = np.column_stack([rows[:, 1:5] + rows[:, 9:5:-1], rows[:, 5]])
+    ends = rows[:, 0] + rows[:, 10]
+    found = np.linalg.lstsq(beside, ends, rcond=None)[0]
+    assert np.max(np.abs(ends - beside @ found)) < 0.02 * np.max(np.abs(ends))
+
+
+def test_a_defect_with_two_levels_is_in_one_of_them_at_any_time():
+    one, force = missing("phi4", "other: two-level-defect")
+    site, u = int(one.about["site"]), one.clean.u
+    level = (force[:, site] / (np.real(one.amount) * u[:, site]))[INSIDE]
+    elsewhere = np.delete(force, site, axis=1)[INSIDE]
+    # A spline swings where the level jumps, six times.
+    settled = np.abs(np.abs(level) - 1) < 0.02
+    assert np.mean(settled) > 0.6
+    signs = np.sign(level[settled])
+    assert 1 <= np.sum(np.diff(signs) != 0) <= 6
+    assert np.median(np.abs(elsewhere)) < 1e-3 * np.median(np.abs(force[INSIDE, site]))
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_viscoelastic_bond_forgets_how_it_was_stretched(name):
+    one, force = missing(name, "other: viscoelastic-bonds")
+    t, u = one.clean.t, one.clean.u
+    speed = CubicSpline(t, u)(t, 1)
+    # The hereditary integral: what was stretched at s is left by exp(-(t - s) / relaxing).
+    for k in (25, 75, 125):
+        weight = np.exp(-(t[k] - t[: k + 1]) / one.about["relaxing"])
+        strain = np.trapezoid(weight[:, None] * speed[: k + 1], t[: k + 1], axis=0)
+        pull = one.amount * (neighbours(strain) - 2 * strain)
+        np.testing.assert_allclose(force[k], pull, atol=1e-3 * np.max(np.abs(force)))
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_bond_is_tired_by_all_that_it_has_borne(name):
+    one, force = missing(name, "other: fatiguing-bonds")
+    t, u = one.clean.t, one.clean.u
+    borne = CubicSpline(t, np.abs(np.diff(u, axis=1)) ** 2).antiderivative()(t)
+    pull = np.zeros_like(force)
+    for bond in range(6):
+        lost = one.amount * borne[:, bond] * (u[:, bond + 1] - u[:, bond])
+        pull[:, bond] -= lost
+        pull[:, bond + 1] += lost
+    np.testing.assert_allclose(force[INSIDE], pull[INSIDE], atol=1e-3 * np.max(np.abs(pull)))
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_servo_pushes_back_by_how_far_and_how_long_the_mean_was_away(name):
+    one, force = missing(name, "other: holding-loop")
+    t = one.clean.t
+    mean = np.mean(one.clean.u, axis=1)
+    summed = CubicSpline(t, mean - mean[0]).antiderivative()(t)
+    pull = np.repeat(-one.amount * summed[:, None], 7, axis=1)
+    np.testing.assert_allclose(force[INSIDE], pull[INSIDE], atol=1e-2 * np.max(np.abs(pull)))
+
+
+def test_a_chain_out_of_sight_pulls_and_is_pulled():
+    one = drawn("phi4", "other: parallel-chain", z=40, noise=0.05)
+    amount, aside = np.real(one.amount), int(one.about["aside"])
+    assert 2 <= abs(aside) <= 4
+    xi = truth_of("phi4")
+
+    def own(u):
+        return xi[0] * (neighbours(u) - 2 * u) + xi[1] * u + xi[2] * u**3
+
+    def rate(_, y):
+        u, v, w, speed = np.split(y, 4)
+        return np.concatenate([v, own(u) + amount * (w - u), speed, own(w) + amount * (u - w)])
+
+    def along(field):
+        padded = np.pad(field, 4, "edge")
+        return padded[4 + aside : 11 + aside]
+
+    t, u, v = one.clean.t, one.clean.u, one.clean.v
+    start = np.concatenate([u[0], v[0], along(u[0]), along(v[0])])
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(u, y[:, :7], atol=1e-6)
+    np.testing.assert_allclose(v, y[:, 7:14], atol=1e-6)
+
+
+def test_light_leaks_into_a_row_of_waveguides_out_of_sight():
+    one = drawn("dnls", "other: parallel-chain", z=40, noise=0.05)
+    coupling, cubic = truth_of("dnls")
+
+    def own(u):
+        return 1j * coupling * (neighbours(u) - 2 * u) + 1j * cubic * abs(u) ** 2 * u
+
+    def rate(_, y):
+        u, w = np.split(y, 2)
+        return np.concatenate([own(u) + one.amount * (w - u), own(w) + one.amount * (u - w)])
+
+    t, u = one.clean.t, one.clean.u
+    beside = np.pad(u[0], 4, "edge")[4 + int(one.about["aside"]) :][:7]
+    start = np.concatenate([u[0], beside]).astype(complex)
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    np.testing.assert_allclose(u, y[:, :7], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["phi4", "sine-gordon"])
+def test_beads_on_bent_wires_keep_an_energy_of_their_own(name):
+    one = drawn(name, "other: bent-wire", z=40, noise=0.05)
+    u, v, bent = one.clean.u, one.clean.v, np.real(one.amount)
+    xi = truth_of(name)
+    site = -xi[1] * u**2 / 2 - xi[2] * u**4 / 4 if name == "phi4" else xi[1] * np.cos(u)
+    stored = np.sum(site, axis=1) + xi[0] / 2 * np.sum(np.diff(u, axis=1) ** 2, axis=1)
+    light = stored + np.sum(v**2, axis=1) / 2
+    energy = light + bent * np.sum((u * v) ** 2, axis=1) / 2
+    assert bent > 0
+    assert np.ptp(energy) < 1e-6 * np.ptp(stored)
+    assert np.ptp(light) > 1e-3 * np.ptp(stored)
+
+
 # Instruments that lie ------------------------------------------------------------------------------------------------------------
 
 
@@ -459,6 +620,9 @@ LIE_ABOUT_BOTH = (
     "other: averaging-readout",
     "other: floating-ground",
     "other: tilted-camera",
+    "other: converter-residue",
+    "other: two-cards",
+    "other: resampled-rows",
 )
 
 
@@ -626,6 +790,94 @@ def test_behind_a_capacitor_what_is_constant_fades(name):
     np.testing.assert_allclose(true - shown, leak * charged, atol=1e-3 * np.max(np.abs(true - shown)))
 
 
+def pairs_of(name, one, **options):
+    """What is read and what there was, of u, and of v where there is one."""
+    plain = drawn(name, NONE, **options)
+    return [(one.clean.u, plain.clean.u), *([] if name == "dnls" else [(one.clean.v, plain.clean.v)])]
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_converter_keeps_a_share_of_what_it_read_before(name):
+    _, _, one = lied(name, "other: converter-residue")
+    share = np.real(one.amount)
+    assert 0 < share < 1
+    for shown, true in pairs_of(name, one):
+        one_after_another = true.reshape(-1)
+        read, _ = lfilter([1 - share], [1, -share], one_after_another, zi=share * one_after_another[:1])
+        np.testing.assert_allclose(shown.reshape(-1), read, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_an_error_of_fringes_is_that_of_a_phase_with_a_small_ghost(name):
+    shown, true, one = lied(name, "other: cyclic-error")
+    size, cycle = np.real(one.amount), one.about["cycle"]
+    for read, field in [(shown.real, true.real), *([] if name == "phi4" else [(shown.imag, true.imag)])]:
+        fringe = np.exp(1j * np.pi * field / cycle)
+        np.testing.assert_allclose(read - field, size * 2 * fringe.real * fringe.imag, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_camera_dims_what_was_bright_a_row_ago(name):
+    shown, true, one = lied(name, "other: auto-exposure")
+    seen = np.real(np.sum(shown * true.conj(), axis=1) / np.sum(np.abs(true) ** 2, axis=1))
+    np.testing.assert_allclose(shown, seen[:, None] * true, atol=1e-12)
+    assert np.array_equal(shown[0], true[0])
+    assert seen[1] == pytest.approx(1, abs=1e-12)
+    light = [sum(abs(number) for number in row) for row in true]
+    for k in range(2, 20):
+        assert (1 - seen[k]) / np.real(one.amount) == pytest.approx((light[k - 1] - light[0]) / light[0], abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_reference_wanders_by_small_steps_for_all_sensors_alike(name):
+    shown, true, one = lied(name, "other: wandering-reference", samples=100)
+    off = (shown - true) / np.real(one.amount)
+    assert np.max(np.abs(off[0])) == 0
+    np.testing.assert_allclose(off, np.repeat(off[:, :1], 7, axis=1), atol=1e-9)
+    if name == "dnls":
+        np.testing.assert_allclose(off.real, off.imag, atol=1e-9)
+    # A random walk: steps that know nothing of each other, by which it gets about one away in the whole time.
+    steps = np.diff(off[:, 0].real) * 10
+    assert np.std(steps) == pytest.approx(1, abs=0.25)
+    assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 0.3
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_a_second_card_falls_behind_the_first(name):
+    _, _, one = lied(name, "other: two-cards")
+    size, t = np.real(one.amount), one.clean.t
+    dense = drawn(name, NONE, samples=400)
+    assert size > 0
+    late = t + size * (t - t[0])
+    seen = late <= dense.clean.t[-1]
+    assert np.sum(seen) > 10
+    for k, (shown, true) in enumerate(pairs_of(name, one)):
+        whole = CubicSpline(dense.clean.t, dense.clean.u if k == 0 else dense.clean.v)
+        np.testing.assert_allclose(shown[:, :3], true[:, :3], atol=1e-7)
+        np.testing.assert_allclose(shown[seen, 3:], whole(late[seen])[:, 3:], atol=1e-5)
+
+
+def test_mixers_that_are_not_alike_show_one_part_larger_than_the_other():
+    shown, true, one = lied("dnls", "other: mixer-imbalance")
+    size = np.real(one.amount)
+    np.testing.assert_allclose(shown.real, (1 + size) * true.real, atol=1e-12)
+    np.testing.assert_allclose(shown.imag, (1 - size) * true.imag, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["phi4", "dnls"])
+def test_resampled_rows_lie_on_straight_lines_between_the_recorders_own(name):
+    _, _, one = lied(name, "other: resampled-rows")
+    dense, step, t = drawn(name, NONE, samples=400), np.sqrt(np.real(one.amount)), one.clean.t
+    own = np.arange(t[0], dense.clean.t[-1], step)
+    seen = t <= own[-1]
+    assert np.sum(seen) > 10
+    for k, (shown, true) in enumerate(pairs_of(name, one)):
+        field = CubicSpline(dense.clean.t, dense.clean.u if k == 0 else dense.clean.v)(own)
+        read = np.stack([np.interp(t[seen], own, column) for column in field.T], axis=1)
+        np.testing.assert_allclose(shown[seen], read, atol=1e-5)
+        assert np.max(np.abs(shown - true)) > 1e-3
+
+
 def test_making_one_does_not_call_the_dynamics_that_fits_use(monkeypatch):
     """But for the size, which is measured on the plain motion, everything is made without it."""
     from bench.loop import specimen
@@ -678,8 +930,9 @@ def test_what_the_equation_has_already_is_no_effect_of_it(name):
 
 def test_the_blind_sets_are_outside_the_catalogue_and_beside_each_other():
     assert [len(BLIND), len(SECOND_BLIND), len(THIRD_BLIND), len(FOURTH_BLIND)] == [10, 8, 10, 10]
-    assert len(OTHERS) == 12 + 10 + 8 + 10 + 10
-    assert {*BLIND, *SECOND_BLIND, *THIRD_BLIND, *FOURTH_BLIND} < set(OTHERS)
+    assert len(FIFTH_BLIND) == 18
+    assert len(OTHERS) == 12 + 10 + 8 + 10 + 10 + 18
+    assert {*BLIND, *SECOND_BLIND, *THIRD_BLIND, *FOURTH_BLIND, *FIFTH_BLIND} < set(OTHERS)
     assert not set(OTHERS) & {one.name for one in CATALOGUE}
 
 
@@ -689,6 +942,9 @@ def test_a_fault_is_for_lattices_that_can_have_it():
     assert not sensible("other: nonlocal-response", systems.find("sine-gordon"))
     assert not sensible("other: slipping-spring", systems.find("ginzburg-landau"))
     assert not sensible("other: braked-site", systems.find("dnls"))
+    assert not sensible("other: bent-wire", systems.find("dnls"))
+    assert not sensible("other: gyroscopic-bonds", systems.find("ginzburg-landau"))
+    assert not sensible("other: mixer-imbalance", systems.find("phi4"))
 
 
 def test_every_effect_of_the_catalogue_can_be_made():
