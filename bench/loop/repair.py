@@ -124,7 +124,7 @@ class Course:
         rounds: the turns.
         left: what is significant in the last residual, the best first.
         verdict: "nothing missing", "explained", "partly explained" or "unexplained".
-        rival: what has no name and would do better in the last effect's place, and by how much (natural logarithms); or None.
+        rival: what has no name and does better in the last effect's place, if only by little, and by how much (natural logarithms); or None.
     """
 
     before: Fitted
@@ -318,7 +318,8 @@ def close(
             one.name for one in ranking
             if one is not best and one.finding.named and one.fitted is not None and one.evidence > least
         )  # fmt: skip
-        rival = found if found[1] > EQUAL and horizon.sees_all(fitted) else None
+        # A name that something without one explains as well is no explanation yet.
+        rival = found if found[1] > 0 and horizon.sees_all(fitted) else None
         rounds.append(Round(tuple(ranking), best.name, near))
         fitted, equal = best.fitted, [*equal, near]
         fitted, equal = _prune(fitted, equal)

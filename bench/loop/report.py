@@ -17,6 +17,7 @@ import numpy as np
 
 from bench.equation import side
 from bench.loop.model import Change, Fitted
+from bench.loop.repair import EQUAL
 from bench.loop.ways import step_of
 from systems.effects import INSTRUMENT, Effect
 from systems.terms import Term
@@ -443,8 +444,8 @@ def notes(diagnosis: Diagnosis) -> list[str]:
     ]
     if course.rival is not None:
         found.append(
-            f"{course.rival[0]} would do better by {course.rival[1]:.1f} (natural logarithms of the likelihood ratio) in the place of the last "
-            "effect, though it is no effect of the catalogue: the name is in doubt."
+            f"{course.rival[0]} does {'better' if course.rival[1] > EQUAL else 'as well'} in the place of the last effect (by {course.rival[1]:.1f}, natural "
+            "logarithms of the likelihood ratio), though it is no effect of the catalogue: the name is in doubt."
         )
     clock = [change for change in course.after.model.changes if change.effect.acts == "clock"]
     if clock:

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
 REAL_TERMS = (
-    "u[n]*v[n]", "u[n]**4", "u[n]**6", "u[n]**7", "sin(u[n])", "sin(2*u[n])", "cos(u[n])", "cos(2*u[n])",
+    "u[n]**4", "u[n]**6", "u[n]**7", "sin(u[n])", "sin(2*u[n])", "cos(u[n])", "cos(2*u[n])",
     "abs(u[n])*u[n]", "t*u[n]", "t", "n*u[n]",
     "u[n+3]+u[n-3]-2*u[n]", "(u[n+1]-u[n])**2-(u[n-1]-u[n])**2", "u[n]**2*(u[n+1]+u[n-1])", "n*(u[n+1]+u[n-1]-2*u[n])",
     "t*(u[n+1]+u[n-1]-2*u[n])", "u[n]*(u[n+1]+u[n-1])",
 )  # fmt: skip
 SECOND_ORDER_TERMS = (
-    "v[n]**3", "u[n]**2*v[n]", "u[n]*v[n]**2", "n*v[n]", "t*v[n]", "v[n+1]+v[n-1]-2*v[n]", "(v[n+1]-v[n-1])/2",
+    "v[n]**3", "u[n]*v[n]", "u[n]**2*v[n]", "u[n]*v[n]**2", "n*v[n]", "t*v[n]", "v[n+1]+v[n-1]-2*v[n]", "(v[n+1]-v[n-1])/2",
     "sqrt(abs(v[n]))*sign(v[n])",
 )  # fmt: skip
 COMPLEX_TERMS = (
@@ -241,6 +241,8 @@ def _steady(path: Path, *, field: bool = True) -> ndarray:
     plain = [own[k] for k in _distinct(tuple(term.text for term, _ in own))]
     if not field:
         plain = [(term, weights) for term, weights in plain if term.text not in ("u[n]", "i*u[n]")]
+    if not plain:
+        return np.zeros((0, len(path.times), dynamics.parts, dynamics.count))
     each = path.sources([term for term, _ in plain]) * np.stack([weights for _, weights in plain])[:, None, None]
     return np.concatenate([np.stack([one, turned(one)]) for one in each]) if path.is_complex else each
 
@@ -296,6 +298,8 @@ def _uneven(tangent: Tangent) -> list[Group]:
     moving, dynamics = places(tangent), tangent.paths[0].record.stretches.dynamics
     if len(moving) < 2 or len(tangent.residual) * len(moving) * len(dynamics.terms) > MOST_NUMBERS:
         return []
+    if not len(_steady(tangent.paths[0], field=False)):
+        return []
     each = dynamics.parts
 
     def columns(_number: int, path: Path) -> ndarray:
@@ -340,13 +344,16 @@ def _in_turn(tangent: Tangent, name: str, make: Callable[[Path], ndarray]) -> li
 
 
 def _lags(tangent: Tangent) -> list[Group]:
-    """Give each of those terms as it was some time before; before the record it is what it was at its beginning."""
-    delays = lags(tangent)
+    """Give each of those terms as it was some time before; before the record it is what it was at its beginning.
+
+    The field itself as it was has a name: memory.
+    """
+    delays = lags(tangent) if len(_steady(tangent.paths[0], field=False)) else []
 
     def late(path: Path) -> ndarray:
         from scipy.interpolate import CubicSpline
 
-        curve = CubicSpline(path.times, _steady(path), axis=1)
+        curve = CubicSpline(path.times, _steady(path, field=False), axis=1)
         return np.concatenate([curve(np.maximum(path.times - delay, path.times[0])) for delay in delays])
 
     return _in_turn(tangent, "a term that comes late", late) if len(delays) else []

@@ -359,6 +359,24 @@ def test_what_does_not_move_is_refused():
         diagnose(library("x", ["u[n]"]), 2, [still], CATALOGUE)
 
 
+@pytest.mark.parametrize(
+    ("terms", "missing"), [("u[n+1]+u[n-1]-2*u[n]", {"damping", "onsite-linear"}), ("u[n+1]+u[n-1]-2*u[n]; u[n]", set()), ("u[n]", None)]
+)  # fmt: skip
+def test_a_real_chain_of_first_order_is_looked_at_as_any_other(terms, missing):
+    """A ladder of resistors and capacitors with a leak: u' = u_{n+1} + u_{n-1} - 2 u_n - 0.3 u_n, solved in closed form by its modes."""
+    sites, t = 8, np.linspace(0, 4, 40)
+    draw = np.random.default_rng(2)
+    exchange = np.eye(sites, k=1) + np.eye(sites, k=-1) - 2 * np.eye(sites)
+    rates, modes = np.linalg.eigh(exchange - 0.3 * np.eye(sites))
+    u = (np.exp(t[:, None] * rates) * (modes.T @ draw.normal(size=sites))) @ modes.T
+    data = Samples(t, u + 0.002 * draw.normal(size=u.shape), None, source="ladder.csv", ends="fixed")
+    course = diagnose(library("own", terms), 1, [data], CATALOGUE).course
+    if missing is None:
+        assert course.verdict != "nothing missing"
+    else:
+        assert {*names(course), *(name for alike in course.equal for name in alike)} == missing
+
+
 def test_trajectories_of_different_lengths_are_looked_at_together():
     data = [waves(30, 3, True), waves(10, 3, True, 1), waves(11, 3, True, 2)]
     found = diagnose(library("x", ["u[n]", "u[n]**3"]), 2, data, CATALOGUE)
