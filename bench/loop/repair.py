@@ -24,7 +24,7 @@ from bench.loop.residual import (
     pooled,
 )
 from bench.loop.tangent import Tangent, linearise
-from bench.loop.trace import Finding, screen
+from bench.loop.trace import Finding, screen, variance_gain
 from bench.loop.ways import SHORTEST_DELAY
 from methods.method import check_fit
 from systems.effects import Effect
@@ -735,13 +735,15 @@ def _taken_away(fitted: Fitted, number: int) -> Fitted | None:
 def _prune(
     fitted: Fitted, equal: list[tuple[str, ...]], *, all_of_them: bool = False
 ) -> tuple[Fitted, list[tuple[str, ...]]]:
-    """Take away earlier effects that the later ones made superfluous."""
+    """Take away earlier effects that the later ones made superfluous.
+
+    A random effect has one parameter, the variance of its coefficients, however many of these there are.
+    """
     number = 0
     while len(fitted.model.changes) > 1 and number < len(fitted.model.changes) - (not all_of_them):
         change = fitted.model.changes[number]
         smaller = _taken_away(fitted, number)
-        columns = max(_columns(change, fitted), 1)
-        if smaller is not None and fitted.gain(smaller) < 2 * columns * np.log(fitted.count) / 2:
+        if smaller is not None and _worth(change, fitted, smaller) < np.log(fitted.count):
             fitted = smaller
             equal = equal[:number] + equal[number + 1 :]
             continue
@@ -791,6 +793,10 @@ def _reconsider(
     return fitted, equal, left
 
 
-def _columns(change: Change, fitted: Fitted) -> int:
+def _worth(change: Change, fitted: Fitted, smaller: Fitted) -> float:
+    """Give twice the log likelihood ratio to a model without a change, for each parameter that this has."""
+    if change.spread is not None:
+        return variance_gain(linearise(smaller), change.effect)
     samples = fitted.data[0]
-    return len(change.forces(samples.sites, samples.is_complex)) + len(change.free)
+    columns = len(change.forces(samples.sites, samples.is_complex)) + len(change.free)
+    return fitted.gain(smaller) / max(columns, 1)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.loop.faults import FAULTS, NONE, OTHERS, PUSHES, ROUNDED, Fault, push
+from bench.loop.faults import FAULTS, MISREADINGS, NONE, OTHERS, PUSHES, ROUNDED, Fault, push
 from bench.loop.faults.setting import Fields, Setting, draw_all, other
 from bench.loop.model import Fitted, Model, refit, rounding_error
 from bench.loop.tangent import Tangent, linearise
@@ -75,7 +75,8 @@ def make(
 
     Args:
         system: its equation is the declared one.
-        name: of the effect: of the catalogue, one of `OTHERS`, or "none"; "a+b" for two that push, each of the size z.
+        name: of the effect: of the catalogue, one of `OTHERS`, or "none"; "a+b" for two that push, or one that does
+            and one of `MISREADINGS`, each of the size z.
         z: its size over the smallest standard error.
         draw: for the places, times and frequencies, the initial state and the noise.
         sites: N.
@@ -90,8 +91,14 @@ def make(
     """
     names = [] if name == NONE else name.split("+")
     for one in names:
-        if one not in (FAULTS if len(names) == 1 else PUSHES):
+        if one not in FAULTS:
             raise unknown("effect", one, [NONE, *(one.name for one in CATALOGUE), *OTHERS])
+    pushing = [one for one in names if one in PUSHES]
+    misread = [one for one in names if one not in PUSHES]
+    if len(names) > 1 and (len(misread) > 1 or not {*misread} <= {*MISREADINGS}):
+        raise InputError(
+            f"effect {name!r}: of several one at most may be of the instrument ({', '.join(MISREADINGS)}), and the others must push"
+        )
     times = sample_times(samples, span)
     chain = motion(system, {}, sites)
     u0, v0 = system.initial_state({}, sites, None, draw if variation else None)
@@ -123,7 +130,8 @@ def make(
             size = z if one == ROUNDED else sight.fitted_size((u, v))
             apart = sight.apart((u, v)) if one in OTHERS else 0.0
         if len(names) > 1:
-            u, v = setting.run(push(setting, amounts))
+            together = replace(setting, standing=push(setting, {one: amounts[one] for one in pushing}))
+            u, v = FAULTS[misread[0]].fields(together, amounts[misread[0]]) if misread else together.run()
     amount = amounts[names[0]] if names else 0.0
     noisy = u + _noise(u, sizes[0], draw)
     if name == ROUNDED:

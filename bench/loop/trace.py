@@ -132,6 +132,15 @@ def screen(
     return rank(tangent, groups, draw, surrogates)
 
 
+def variance_gain(tangent: Tangent, effect: Effect) -> float:
+    """Give twice the log likelihood ratio of the best variance that a random effect's coefficients may have; 0 where it is none."""
+    tries = [one for one in ways(tangent, effect) if one.spread is not None]
+    scores = _scores(
+        [(effect.name, True, tries)], tangent.residual[:, None], float(np.sum(tangent.residual**2)), tangent.spare
+    )
+    return float(np.max(scores[0][0], initial=0.0)) if tries else 0.0
+
+
 def rank(
     tangent: Tangent, groups: Sequence[tuple[str, bool, list[Try]]], draw: np.random.Generator, surrogates: int
 ) -> list[Finding]:

@@ -72,7 +72,8 @@ def markdown(table: pd.DataFrame) -> str:
 def page(table: pd.DataFrame) -> str:
     """Write the page."""
     noisy, exact = table[table["noise"] > 0], table[table["noise"] == 0]
-    ended = table["ok"].str.split("/", expand=True).astype(int).sum()
+    seeds = table["ok"].str.split("/", expand=True).astype(int)
+    ended = seeds.sum()
     trajectory = noisy[noisy["method"] == "trajectory"]
     lost = trajectory[trajectory["ratio"] > LOST]
     kept, selected = (noisy[~noisy["own"] & (noisy["method"] == name)] for name in ("trajectory", "weak"))
@@ -81,7 +82,8 @@ def page(table: pd.DataFrame) -> str:
         "# Everything crossed with everything\n",
         f"Made by `python results/cross/cross.py` from [summary.csv](summary.csv): {len(table.groupby(['data', 'library']))} kinds of data and libraries, "
         f"{ended[1]} fits, {ended[0]} of which ended. `own terms`: the four terms of the lattice's own equation and its like; `large`: 10 to 13 terms. "
-        "Three seeds, one for `trajectory` and where there is no noise.\n",
+        f"Seeds: {seeds.loc[noisy.index, 1].max()} with noise, {seeds.loc[trajectory.index, 1].max()} for `trajectory`, "
+        f"{seeds.loc[exact.index, 1].max()} where there is no noise.\n",
         "## With noise (0.1, 1, 5, 10 %)\n",
         markdown(methods(noisy)),
         "\nA library with every term kept is bounded by its own, larger bound; `weak`, `stlsq` and `sr3` select, `trajectory` here does not: it keeps what "

@@ -80,12 +80,16 @@ def _pushing(names: dict[str, Callable[[pushes.Moment], np.ndarray]]) -> dict[st
     }
 
 
-CATALOGUED = {
-    **_pushing(pushes.CATALOGUED),
+# Of the instrument: they can be there beside what pushes the chain.
+MISREADINGS = {
     "sensor-offset": _misread(instrument.offset),
     "sensor-gain": _misread(instrument.gain),
     "sensor-curve": _misread(instrument.curve),
     "clock": _misread(instrument.jitter),
+}
+CATALOGUED = {
+    **_pushing(pushes.CATALOGUED),
+    **MISREADINGS,
     ROUNDED: Fault(lambda setting, _: setting.run(), real=True, sized=False),
     "ends": Fault(unseen.ends, real=True, sized=False),
     "unequal-masses": Fault(unseen.unequal_masses, real=True),
@@ -163,6 +167,7 @@ __all__ = [
     "FAULTS",
     "FIFTH_BLIND",
     "FOURTH_BLIND",
+    "MISREADINGS",
     "NONE",
     "OTHERS",
     "PUSHES",

@@ -80,12 +80,14 @@ class Setting:
         start: its state at the first time.
         times: of the samples (T,).
         drawn: what was drawn for the fault.
+        standing: what pushes the chain besides the fault, if anything does.
     """
 
     chain: Motion
     start: ndarray
     times: Float[ndarray, " time"]
     drawn: Drawn
+    standing: Push | None = None
 
     @property
     def one(self) -> Float[ndarray, " sites"]:
@@ -100,12 +102,13 @@ class Setting:
         """
         chain, rate = self.chain, self.chain.right_hand_side
         size = chain.parts * chain.sites
+        pushes = [one for one in (self.standing, push) if one is not None]
 
         def forced(t: float, y: ndarray) -> ndarray:
             change = rate(t, y)
-            if push is not None:
+            if pushes:
                 u, v = chain.unpack(y)
-                change[-size:] += self.parts(push(t, u, u if v is None else v))
+                change[-size:] += sum(self.parts(one(t, u, u if v is None else v)) for one in pushes)
             return change
 
         return chain.unpack(integrated(forced, self.start, self.times))
@@ -189,7 +192,7 @@ def draw_all(name: str, sites: int, times: ndarray, draw: np.random.Generator) -
     }
     each = draw.normal(size=sites)
     about["delay"] = span * draw.uniform(0.08, 0.2)
-    late = draw.normal(size=len(times)) if name == "clock" else None
+    late = draw.normal(size=len(times)) if "clock" in name.split("+") else None
     force = None
     if name == "known-input":
         force = np.cumsum(draw.normal(size=(len(times), sites)), axis=0)

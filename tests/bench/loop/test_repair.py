@@ -12,11 +12,13 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import systems
-from bench.loop.model import Model
-from bench.loop.repair import FORCES, close, diagnose
+from bench.loop.model import Model, first_fit
+from bench.loop.repair import FORCES, _prune, close, diagnose, polish
 from bench.loop.residual import over_noise
 from bench.loop.specimen import make
-from systems.effects import CATALOGUE
+from bench.loop.tangent import linearise
+from bench.loop.trace import screen
+from systems.effects import CATALOGUE, find
 from systems.errors import InputError
 from systems.lattice import library
 from systems.samples import Samples, read_all
@@ -276,6 +278,22 @@ def test_of_two_effects_at_once_both_are_found_with_their_sizes():
     assert found.forecast[1] < found.forecast[0]
     assert found.criterion[1] < found.criterion[0] - 100
     assert len(watched) > 4
+
+
+def test_late_rows_stay_when_another_effect_is_added():
+    """However many rows there are, that they are late is one thing: the variance of how late."""
+    system = systems.find("phi4")
+    one = make(system, "damping+clock", 13, np.random.default_rng(4), sites=9, samples=40, span=8.0, variation=True)
+    data = [replace(one.samples.observed(), ends=system.ends)]
+    fitted = first_fit(Model(system.library("equation"), system.order), data)
+    for name in ("clock", "damping"):
+        found = screen(linearise(fitted), [find(name)], np.random.default_rng(0), 20)
+        change = next(finding.change for finding in found if finding.name == name)
+        with_it = polish(fitted.model.with_change(change), fitted)
+        assert with_it is not None
+        fitted = with_it
+    pruned, _ = _prune(fitted, [(), ()], all_of_them=True)
+    assert [change.effect.name for change in pruned.model.changes] == ["clock", "damping"]
 
 
 def test_the_truth_of_simulated_samples_is_not_looked_at_and_the_same_seed_gives_the_same_course():

@@ -958,6 +958,31 @@ def test_an_unknown_effect_is_refused_by_name():
         sensible("dampng", systems.find("phi4"))
 
 
+def test_a_chain_may_be_damped_and_misread_at_once():
+    """The readings of one site over those of a damped chain are one number, all others' are 1."""
+    one, plain = (drawn("phi4", effect, z=40, noise=0.05) for effect in ("damping+sensor-gain", NONE))
+    xi, amount = truth_of("phi4"), np.real(one.amount)
+
+    def rate(_t, y):
+        u, v = np.split(y, 2)
+        return np.concatenate([v, xi[0] * (neighbours(u) - 2 * u) + xi[1] * u + xi[2] * u**3 - amount * v])
+
+    start = np.concatenate([plain.clean.u[0], plain.clean.v[0]])
+    y = solve_ivp(rate, one.clean.t[[0, -1]], start, t_eval=one.clean.t, method="DOP853", rtol=1e-10, atol=1e-11).y.T
+    scale = np.sum(one.clean.u * y[:, :7], axis=0) / np.sum(y[:, :7] ** 2, axis=0)
+    np.testing.assert_allclose(one.clean.u, scale * y[:, :7], atol=1e-6)
+    np.testing.assert_allclose(one.clean.v, scale * y[:, 7:], atol=1e-6)
+    site = int(one.about["site"])
+    np.testing.assert_allclose(np.delete(scale, site), 1, atol=1e-6)
+    assert abs(scale[site] - 1) > 0.01
+
+
+def test_of_two_effects_one_at_most_may_be_of_the_instrument():
+    for pair in ("sensor-gain+clock", "damping+memory"):
+        with pytest.raises(InputError, match="one at most may be of the instrument"):
+            drawn("phi4", pair)
+
+
 def test_an_effect_that_does_nothing_is_refused():
     with pytest.raises(InputError, match="of no size is visible"):
         drawn("phi4", "onsite-linear")
