@@ -151,16 +151,15 @@ def by_effect(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def confusion(frame: pd.DataFrame, least: float = 10.0) -> Figure:
-    """Draw which effect was named first for each effect that was there."""
+    """Draw which effect was named first for each effect that was there; all that were named where only pairs were there."""
     from matplotlib.figure import Figure
 
-    ran = frame[
-        (frame["status"] == "ok")
-        & ((frame["z"] >= least) | (frame["effect"] == NONE))
-        & ~frame["effect"].str.contains("+", regex=False)
-    ]
+    ran = frame[(frame["status"] == "ok") & ((frame["z"] >= least) | (frame["effect"] == NONE))]
+    pairs = ran["effect"].str.contains("+", regex=False)
+    ran = ran if pairs.all() else ran[~pairs]
     first = [
-        text.split(" + ")[0] if text else verdict for text, verdict in zip(ran["named"], ran["verdict"], strict=True)
+        (text if pairs.all() else text.split(" + ")[0]) or verdict
+        for text, verdict in zip(ran["named"], ran["verdict"], strict=True)
     ]
     counts = pd.crosstab(ran["effect"], pd.Series(first, index=ran.index))
     order = [name for name in counts.index if name in counts.columns]
@@ -169,7 +168,9 @@ def confusion(frame: pd.DataFrame, least: float = 10.0) -> Figure:
         index=[*order, *(name for name in counts.index if name not in order)], columns=[*order, *rest]
     )
     share = counts.div(counts.sum(axis=1), axis=0).fillna(0.0)
-    figure = Figure(figsize=(11, 3 + 0.2 * len(counts)), layout="constrained")
+    # As high as the rows and the names below them need.
+    names = max(len(name) for name in counts.columns) if len(counts.columns) else 0
+    figure = Figure(figsize=(11, 1.5 + 0.2 * len(counts) + 0.085 * names), layout="constrained")
     axes = figure.add_subplot()
     axes.imshow(share.to_numpy(), cmap="Blues", vmin=0, vmax=1, aspect="auto")
     axes.set_xticks(np.arange(share.shape[1]), share.columns, rotation=90)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import systems
@@ -75,7 +76,21 @@ def test_a_run_continues_where_it_was_stopped_and_is_published(tmp_path: Path) -
     assert json.loads(json.dumps(rows)) == rows
 
 
-def test_a_name_in_a_group_of_three_is_notis_right() -> None:
+def test_the_picture_shows_what_was_named_first_or_of_pairs_alone_all() -> None:
+    frame = pd.DataFrame(
+        [("damping+drive", "drive + damping", "explained"), ("damping+drive", "", "unexplained"), ("drive", "drive + kick", "explained")],
+        columns=["effect", "named", "verdict"],
+    ).assign(status="ok", z=20.0)  # fmt: skip
+
+    def shown(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
+        axes = scores.confusion(rows).axes[0]
+        return [one.get_text() for one in axes.get_yticklabels()], [one.get_text() for one in axes.get_xticklabels()]
+
+    assert shown(frame) == (["drive"], ["drive"])
+    assert shown(frame[:2]) == (["damping+drive"], ["drive + damping", "unexplained"])
+
+
+def test_a_name_in_a_group_of_three_is_not_right() -> None:
     from bench.loop.trial import is_right
 
     assert is_right(["damping"], ["damping"], [[]], "explained", "damping")
