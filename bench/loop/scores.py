@@ -196,7 +196,7 @@ def publish(rows: Sequence[Mapping[str, Any]], about: Mapping[str, Any], out: Pa
     """Write the tables as CSV and Markdown, and the picture."""
     out.mkdir(parents=True, exist_ok=True)
     made = [row for row in rows if "effect" in row]
-    measured = [row for row in rows if "terms" in row]
+    measured = sorted((row for row in rows if "terms" in row), key=lambda row: str(row["name"]))
     head = [f"- {line}" for line in lines(about)]
     written = []
     if made:
