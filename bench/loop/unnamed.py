@@ -344,16 +344,23 @@ def _in_turn(tangent: Tangent, name: str, make: Callable[[Path], ndarray]) -> li
 
 
 def _lags(tangent: Tangent) -> list[Group]:
-    """Give each of those terms as it was some time before; before the record it is what it was at its beginning.
+    """Give each of those terms, and the neighbours' sum, as it was some time before; before the record it is what it was at its beginning.
 
     The field itself as it was has a name: memory.
     """
-    delays = lags(tangent) if len(_steady(tangent.paths[0], field=False)) else []
+    dynamics = tangent.paths[0].record.stretches.dynamics
+    beside = Term("u[n+1]+u[n-1]")
+    alone = dynamics.sites < 2 or too_wide(beside, dynamics)
+    delays = lags(tangent) if not alone or len(_steady(tangent.paths[0], field=False)) else []
 
     def late(path: Path) -> ndarray:
         from scipy.interpolate import CubicSpline
 
-        curve = CubicSpline(path.times, _steady(path, field=False), axis=1)
+        kinds = [_steady(path, field=False)]
+        if not alone:
+            (sum_of_both,) = path.sources([beside])
+            kinds.append(np.stack([sum_of_both, turned(sum_of_both)] if path.is_complex else [sum_of_both]))
+        curve = CubicSpline(path.times, np.concatenate(kinds), axis=1)
         return np.concatenate([curve(np.maximum(path.times - delay, path.times[0])) for delay in delays])
 
     return _in_turn(tangent, "a term that comes late", late) if len(delays) else []

@@ -41,7 +41,7 @@ def diagnosed(system: str, effect: str, z: float) -> Diagnosis:
 
 @pytest.fixture(scope="module")
 def damped() -> Diagnosis:
-    return diagnosed("phi4", "damping", 20)
+    return diagnosed("phi4", "damping", 30)
 
 
 @pytest.fixture(scope="module")
