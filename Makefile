@@ -36,6 +36,9 @@ $(READY): requirements.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	rm -rf $(VENV)/typed && mkdir -p $(VENV)/typed/latticebench
+	for part in latticebench/*.py latticebench/py.typed systems methods diagnosis bench; do \
+		ln -s "$(CURDIR)/$$part" $(VENV)/typed/latticebench/; done
 	@touch $(READY)
 
 clean:

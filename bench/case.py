@@ -22,16 +22,16 @@ from typing import Any
 
 import numpy as np
 
-import methods
-from bench.limit import Limit, bound_of
-from bench.score import Forecast, forecast, score
-from bench.suite import Case
-from methods.method import Fit, Skipped, make, solve
-from methods.regression import Regression, assemble
-from systems.errors import InputError
-from systems.lattice import Library, System, motion
-from systems.samples import Samples, SimulatedSamples
-from systems.simulate import observe, sample_times, simulate
+from latticebench import methods
+from latticebench.bench.limit import Limit, bound_of
+from latticebench.bench.score import Forecast, forecast, score
+from latticebench.bench.suite import Case
+from latticebench.methods.engine.regression import Regression, assemble
+from latticebench.methods.method import Fit, Skipped, make, solve
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Library, System, motion
+from latticebench.systems.samples import Samples, SimulatedSamples
+from latticebench.systems.simulate import observe, sample_times, simulate
 
 # Points kept of a method's history: enough for a figure, small enough for a store.
 MAX_RECORDS = 200
@@ -202,7 +202,7 @@ def _simulated(
     seed: int,
     base: Path,
 ) -> list[SimulatedSamples]:
-    import systems
+    from latticebench import systems
 
     system = systems.find(name, base)
     made = []

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from systems.errors import InputError, unknown
+from latticebench.systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
-    from bench.limit import Design, Limit
-    from bench.suite import Case, Suite
-    from methods.method import Fit
-    from systems.lattice import Library, System
-    from systems.samples import Samples
+    from latticebench.bench.limit import Design, Limit
+    from latticebench.bench.suite import Case, Suite
+    from latticebench.methods.method import Fit
+    from latticebench.systems.lattice import Library, System
+    from latticebench.systems.samples import Samples
 
 app = typer.Typer(
     name="latticebench",
@@ -78,13 +78,13 @@ def _complain(text: str) -> None:
 
 
 def _systems(incomplete: str) -> list[str]:
-    import systems
+    from latticebench import systems
 
     return [name for name in systems.names() if name.startswith(incomplete)]
 
 
 def _methods(incomplete: str) -> list[str]:
-    import methods
+    from latticebench import methods
 
     return [name for name in methods.registered() if name.startswith(incomplete)]
 
@@ -94,21 +94,21 @@ def _suites(incomplete: str) -> list[str]:
 
 
 def _libraries(incomplete: str) -> list[str]:
-    import systems
+    from latticebench import systems
 
     found = {library.name for name in systems.names() for library in systems.find(name).libraries}
     return sorted(name for name in found if name.startswith(incomplete))
 
 
 def _recordings(incomplete: str) -> list[str]:
-    from bench.recordings import RECORDINGS
+    from latticebench.bench.recordings import RECORDINGS
 
     return [one.name for one in RECORDINGS if one.name.startswith(incomplete)]
 
 
 def _suite_files() -> list[Path]:
     here = Path(__file__).parent
-    return sorted((*here.glob("suites/*.toml"), *here.glob("loop/suites/*.toml")), key=lambda path: path.stem)
+    return sorted((*here.glob("suites/*.toml"), *here.glob("trials/suites/*.toml")), key=lambda path: path.stem)
 
 
 SystemName = Annotated[
@@ -126,7 +126,7 @@ def list_(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
 ) -> None:
     """Say what there is."""
-    from bench.screen import show_rows
+    from latticebench.bench.screen import show_rows
 
     makers = {
         "systems": _system_rows, "libraries": _library_rows, "methods": _method_rows, "suites": _suite_rows,
@@ -140,7 +140,7 @@ def list_(
 
 
 def _system_rows() -> list[dict[str, Any]]:
-    import systems
+    from latticebench import systems
 
     rows = []
     for name in systems.names():
@@ -156,7 +156,7 @@ def _system_rows() -> list[dict[str, Any]]:
 
 
 def _library_rows() -> list[dict[str, Any]]:
-    import systems
+    from latticebench import systems
 
     return [
         {
@@ -172,8 +172,8 @@ def _library_rows() -> list[dict[str, Any]]:
 
 
 def _method_rows() -> list[dict[str, Any]]:
-    import methods
-    from methods.method import settings
+    from latticebench import methods
+    from latticebench.methods.method import settings
 
     return [
         {"name": name, "what it is": (kind.__doc__ or "").strip().splitlines()[0], "settings": settings(kind)}
@@ -182,7 +182,7 @@ def _method_rows() -> list[dict[str, Any]]:
 
 
 def _effect_rows() -> list[dict[str, Any]]:
-    from systems.effects import CATALOGUE, HOW
+    from latticebench.systems.effects import CATALOGUE, HOW
 
     return [
         {
@@ -195,7 +195,7 @@ def _effect_rows() -> list[dict[str, Any]]:
 
 
 def _suite_rows() -> list[dict[str, Any]]:
-    from systems.toml import read_toml
+    from latticebench.systems.toml import read_toml
 
     return [{"name": path.stem, "what it is for": read_toml(path).get("title", "")} for path in _suite_files()]
 
@@ -225,9 +225,9 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise, gaps and uneven times.")] = 1,
 ) -> None:
     """Simulate a system and write samples of it."""
-    import systems
-    from bench.case import samples as make_samples
-    from systems.samples import FORMATS, write
+    from latticebench import systems
+    from latticebench.bench.case import samples as make_samples
+    from latticebench.systems.samples import FORMATS, write
 
     found = systems.find(system)
     if out.suffix.lower() not in FORMATS:
@@ -270,11 +270,11 @@ def fit(
     ] = None,
 ) -> None:
     """Fit the coefficients of a library to recorded samples."""
-    import methods
-    from bench.screen import show_fit, waiting
-    from methods.method import make, solve
-    from systems.files import write_text
-    from systems.samples import read_all
+    from latticebench import methods
+    from latticebench.bench.screen import show_fit, waiting
+    from latticebench.methods.method import make, solve
+    from latticebench.systems.files import write_text
+    from latticebench.systems.samples import read_all
 
     method = method or methods.DEFAULT
     chosen = make(methods.find(method), _texts(given))
@@ -340,13 +340,13 @@ def diagnose(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated noise that evidence is judged by.")] = 1,
 ) -> None:
     """Say what a declared equation lacks: find the residual, trace it to an effect, add that, and show the error before and after."""
-    import methods
-    from bench.loop.repair import diagnose as close_the_loop
-    from bench.loop.report import content, show, watching
-    from methods.method import make, solve
-    from systems.effects import CATALOGUE, load
-    from systems.files import write_text
-    from systems.samples import read_all
+    from latticebench import methods
+    from latticebench.bench.report.report import content, show, watching
+    from latticebench.diagnosis.repair import diagnose as close_the_loop
+    from latticebench.methods.method import make, solve
+    from latticebench.systems.effects import CATALOGUE, load
+    from latticebench.systems.files import write_text
+    from latticebench.systems.samples import read_all
 
     if system is not None and (terms is not None or order is not None):
         raise InputError(
@@ -376,8 +376,8 @@ def diagnose(
     text = json.dumps(content(found), indent=2, allow_nan=False) + "\n"
     # Files first: whoever reads the screen may stop reading.
     if html_out is not None:
-        from bench.loop.page import write_page
-        from bench.provenance import command_line, origin
+        from latticebench.bench.provenance import command_line, origin
+        from latticebench.bench.report.page import write_page
 
         write_page(found, {"command": " ".join(["latticebench", *command_line()]), "seed": seed, **origin()}, html_out)
     if json_out == "-":
@@ -391,7 +391,7 @@ def diagnose(
 def _declared(system: str | None, terms: str | None, order: int | None) -> tuple[System | None, Library, int]:
     """Make out which equation is declared: the system's own terms, or those given."""
     if system is not None:
-        import systems
+        from latticebench import systems
 
         if EQUATION not in [one.name for one in systems.find(system).libraries]:
             raise InputError(
@@ -417,7 +417,7 @@ def data(
     """List measured recordings, and take a local copy of one."""
     if context.invoked_subcommand is not None:
         return
-    from bench.recordings import RECORDINGS
+    from latticebench.bench.recordings import RECORDINGS
 
     rows = [dataclasses.asdict(one) for one in RECORDINGS]
     if as_json:
@@ -439,7 +439,7 @@ def take(
     ] = None,
 ) -> None:
     """Check that a file is a recording, by its SHA-256, and copy it to where you want it. Nothing is downloaded."""
-    from bench.recordings import take as copy
+    from latticebench.bench.recordings import take as copy
 
     made, new = copy(name, origin, place)
     print(f"{made}: {'copied' if new else 'was there already'}, SHA-256 as it should be")
@@ -449,8 +449,8 @@ def _asked(
     system: str | None, library: str | None, terms: str | None, order: int | None
 ) -> tuple[System | None, Library, int]:
     """Make out which library and order --system, --library, --terms and --order ask for."""
-    import systems
-    from systems.lattice import library as make_library
+    from latticebench import systems
+    from latticebench.systems.lattice import library as make_library
 
     known = None if system is None else systems.find(system)
     if terms is not None and library is not None:
@@ -478,7 +478,7 @@ def _case(**given: Any) -> Case:
     """Check what describes simulated samples."""
     import pydantic
 
-    from bench.suite import Case
+    from latticebench.bench.suite import Case
 
     try:
         return Case(**{"library": "", "label": "", "method": "", **given})
@@ -512,16 +512,16 @@ def run(
     as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
 ) -> None:
     """Run a suite, continuing where it was stopped, and show its table of errors."""
-    from bench.loop.trial import is_suite
+    from latticebench.bench.trials.trial import is_suite
 
     if is_suite(suite):
         _run_trials(suite, jobs or os.cpu_count() or 1, results, data, as_json)
         return
-    from bench.provenance import command_line, describe
-    from bench.run import run as run_suite
-    from bench.screen import progress_bar, show_results
-    from bench.store import create
-    from bench.suite import load
+    from latticebench.bench.provenance import command_line, describe
+    from latticebench.bench.run import run as run_suite
+    from latticebench.bench.screen import progress_bar, show_results
+    from latticebench.bench.store import create
+    from latticebench.bench.suite import load
 
     loaded = load(suite)
     folder = results if results is not None else Path("runs") / loaded.name
@@ -552,10 +552,10 @@ def run(
 
 def _run_trials(suite: str, jobs: int, results: Path | None, data: Path, as_json: bool) -> None:
     """Run a suite of diagnoses, and show how often they were right."""
-    from bench.loop.trial import load, run
-    from bench.provenance import command_line
-    from bench.screen import progress
-    from systems.files import write_text
+    from latticebench.bench.provenance import command_line
+    from latticebench.bench.screen import progress
+    from latticebench.bench.trials.trial import load, run
+    from latticebench.systems.files import write_text
 
     _, trials = load(suite)
     folder = results if results is not None else Path("runs") / Path(suite).stem
@@ -571,8 +571,8 @@ def _run_trials(suite: str, jobs: int, results: Path | None, data: Path, as_json
 
 def _show_trials(folder: Path, out: Path | None, as_json: bool) -> None:
     """Show the results of a suite of diagnoses, and publish them."""
-    from bench.loop import scores
-    from bench.screen import show_rows
+    from latticebench.bench.screen import show_rows
+    from latticebench.bench.trials import scores
 
     rows = scores.read(folder)
     if as_json:
@@ -602,11 +602,11 @@ def table(
     as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
 ) -> None:
     """Show the results of a run as a table, and publish them."""
-    from bench.loop import scores
-    from bench.provenance import describe
-    from bench.screen import show_results
-    from bench.store import open_store
-    from bench.tables import SCORES, TABLES, publish
+    from latticebench.bench.provenance import describe
+    from latticebench.bench.screen import show_results
+    from latticebench.bench.store import open_store
+    from latticebench.bench.tables import SCORES, TABLES, publish
+    from latticebench.bench.trials import scores
 
     if value not in SCORES:
         raise unknown("score", value, SCORES, "--value")
@@ -636,9 +636,9 @@ def figures(
     ] = None,
 ) -> None:
     """Draw the results of a run: coefficients against iteration, errors, error against time and noise."""
-    from bench.figures import FIGURES, draw_all
-    from bench.provenance import describe
-    from bench.store import open_store
+    from latticebench.bench.figures import FIGURES, draw_all
+    from latticebench.bench.provenance import describe
+    from latticebench.bench.store import open_store
 
     chosen = _some(only, FIGURES, "figure")
     store = open_store(folder)
@@ -657,8 +657,8 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
 ) -> None:
     """Say which cases got better or worse; exit code 1 when any got worse."""
-    from bench.compare import compare as compare_tables
-    from bench.tables import read_cases
+    from latticebench.bench.compare import compare as compare_tables
+    from latticebench.bench.tables import read_cases
 
     found = compare_tables(read_cases(old), read_cases(new), factor)
     if as_json:
@@ -722,9 +722,9 @@ def limit(
     Options from --set to --initial are about samples of a system; of recorded ones everything is known but their noise, which
     is taken from a fit.
     """
-    from bench.limit import denser, design
-    from bench.screen import show_limit, waiting
-    from systems.files import write_text
+    from latticebench.bench.limit import denser, design
+    from latticebench.bench.screen import show_limit, waiting
+    from latticebench.systems.files import write_text
 
     known, candidates, order = _asked(system, library, terms, order)
     only_simulated = {
@@ -735,7 +735,7 @@ def limit(
         for name, value in only_simulated.items():
             if value is not None:
                 raise InputError(f"{name}: files are given, whose samples are as they are; leave it out, or the files")
-        from systems.samples import read_all
+        from latticebench.systems.samples import read_all
 
         data = read_all(files, ends or "unknown")
         with waiting(f"fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
@@ -751,7 +751,7 @@ def limit(
     else:
         if known is None or system is None:
             raise InputError("give one or more files, or --system: the bound is about samples")
-        from bench.case import bound
+        from latticebench.bench.case import bound
 
         case = _case(
             system=system, parameters=_numbers(given), sites=sites, initial=initial, library=candidates.name,
@@ -784,8 +784,8 @@ def limit(
 
 def _followed(data: Sequence[Samples], candidates: Library, order: int) -> Fit:
     """Fit by the method that gives the motion it follows."""
-    import methods
-    from methods.method import solve
+    from latticebench import methods
+    from latticebench.methods.method import solve
 
     method = next(kind() for kind in methods.registered().values() if kind().abilities.motion)
     with _told(data, None, "the fit"):
@@ -799,7 +799,7 @@ def _told(data: Sequence[Samples], method: str | None, what: str) -> Iterator[No
     Raises:
         InputError: it was skipped, or it failed.
     """
-    from methods.method import Skipped
+    from latticebench.methods.method import Skipped
 
     try:
         yield
@@ -875,15 +875,15 @@ def _jsonable(value: Any) -> Any:
 
 
 def _cases_json(results: Sequence[Mapping[str, Any]]) -> str:
-    from bench.tables import cases
+    from latticebench.bench.tables import cases
 
     return json.dumps(_jsonable(cases(results).to_dict("records")), indent=2)
 
 
 def _contestants(suite: Suite) -> dict[str, str]:
     """Say what each label of a suite stands for, with all its settings."""
-    import methods
-    from methods.method import make, settings
+    from latticebench import methods
+    from latticebench.methods.method import make, settings
 
     written = {}
     for case in suite.cases:

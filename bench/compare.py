@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from systems.errors import InputError
+from latticebench.systems.errors import InputError
 
 # Round-off differs between machines; errors below this are all the same.
 FLOOR = 1e-9

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from bench.provenance import lines
-from bench.suite import Case
-from bench.tables import cases, summary
-from systems.files import whole
-from systems.terms import Term
+from latticebench.bench.provenance import lines
+from latticebench.bench.suite import Case
+from latticebench.bench.tables import cases, summary
+from latticebench.systems.files import whole
+from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

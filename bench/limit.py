@@ -21,17 +21,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from systems.errors import InputError
-from systems.lattice import Ends, Library, System
-from systems.samples import Samples, SimulatedSamples
-from systems.sensitivity import Drive, Dynamics, Stretches, condense, split_parts
-from systems.simulate import noise_size, simulate
+from latticebench.methods.engine.sensitivity import Drive, Dynamics, Stretches, condense, split_parts
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Ends, Library, System
+from latticebench.systems.samples import Samples, SimulatedSamples
+from latticebench.systems.simulate import noise_size, simulate
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from methods.method import Fit
+    from latticebench.methods.method import Fit
 
 # A coefficient or a sum counts as known below this relative error, and as roughly known while it can be told from 0.
 KNOWN = 0.1

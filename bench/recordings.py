@@ -11,8 +11,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from systems.errors import InputError, unknown
-from systems.files import whole
+from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.files import whole
 
 # Where copies go unless told otherwise.
 FOLDER = Path("data")

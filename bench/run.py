@@ -17,10 +17,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from bench.case import blank, run_case
-from bench.provenance import origin
-from bench.store import Store
-from bench.suite import Case, Suite
+from latticebench.bench.case import blank, run_case
+from latticebench.bench.provenance import origin
+from latticebench.bench.store import Store
+from latticebench.bench.suite import Case, Suite
 
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from systems.errors import InputError
-from systems.lattice import Library, Motion
-from systems.samples import Samples
-from systems.simulate import follow
-from systems.terms import combination
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Library, Motion
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import follow
+from latticebench.systems.terms import combination
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -7,15 +7,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from bench.equation import written
+from latticebench.bench.report.equation import written
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
-    from bench.limit import Design, Limit
-    from bench.suite import Case
-    from methods.method import Fit
+    from latticebench.bench.limit import Design, Limit
+    from latticebench.bench.suite import Case
+    from latticebench.methods.method import Fit
 
 MEANINGS = {"e2": "relative error of the coefficients, median over seeds"}
 
@@ -96,8 +96,8 @@ def show_limit(limit: Limit, design: Design, note: str) -> None:
 
 def show_results(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], title: str, value: str = "e2") -> None:
     """Print a run's results: one score by data and method, what went wrong, and where the figures come from."""
-    from bench.provenance import lines
-    from bench.tables import cases, matrix
+    from latticebench.bench.provenance import lines
+    from latticebench.bench.tables import cases, matrix
 
     every = cases(results)
     screen = console()

@@ -10,9 +10,9 @@ import inspect
 from collections.abc import Iterable
 from pathlib import Path
 
-import systems
+from latticebench import systems
 
-PACKAGES = ("systems", "methods", "bench")
+PACKAGE = "latticebench"
 
 
 def fingerprint(kinds: Iterable[type], system: str, base: Path) -> str:
@@ -25,7 +25,7 @@ def fingerprint(kinds: Iterable[type], system: str, base: Path) -> str:
         system: a system's name or file.
         base: the folder that a relative path starts from.
     """
-    files = {Path(inspect.getfile(kind)) for kind in kinds} | {_module_file("bench.case")}
+    files = {Path(inspect.getfile(kind)) for kind in kinds} | {_module_file("latticebench.bench.case")}
     if system.endswith((".py", ".toml")):
         files.add(base / system)
     else:
@@ -47,7 +47,7 @@ def _home(system: str) -> str:
     import pkgutil
 
     for info in pkgutil.iter_modules(systems.__path__):
-        module = importlib.import_module(f"systems.{info.name}")
+        module = importlib.import_module(f"latticebench.systems.{info.name}")
         if getattr(getattr(module, "SYSTEM", None), "name", None) == system:
             return module.__name__
     raise AssertionError(system)
@@ -74,7 +74,7 @@ def _imports(path: Path, changed: int) -> set[Path]:  # noqa: ARG001
     files = set()
     # A package's __init__ looks its modules up by name and computes nothing.
     for name in names:
-        if name.split(".")[0] in PACKAGES and name not in PACKAGES:
+        if name.split(".")[0] == PACKAGE and name.count(".") > 1:
             try:
                 files.add(_module_file(name))
             except (ModuleNotFoundError, AssertionError):

@@ -17,10 +17,10 @@ from typing import Any
 
 import pydantic
 
-from bench.case import blank
-from bench.suite import Case
-from systems.errors import InputError
-from systems.files import write_text
+from latticebench.bench.case import blank
+from latticebench.bench.suite import Case
+from latticebench.systems.errors import InputError
+from latticebench.systems.files import write_text
 
 VERSION = 2
 RESULT = blank(Case.model_construct()).keys() | {"made"}

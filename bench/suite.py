@@ -31,13 +31,12 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-import methods
-import systems
-from bench.source import fingerprint
-from methods.method import make
-from systems.errors import InputError, unknown
-from systems.lattice import Library, System, library
-from systems.toml import read_toml
+from latticebench import methods, systems
+from latticebench.bench.source import fingerprint
+from latticebench.methods.method import make
+from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.lattice import Library, System, library
+from latticebench.systems.toml import read_toml
 
 HERE = Path(__file__).parent / "suites"
 MOST_SEEDS = 10_000

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.provenance import lines
-from bench.suite import Case
-from systems.errors import InputError
-from systems.files import write_text
-from systems.terms import Term
+from latticebench.bench.provenance import lines
+from latticebench.bench.suite import Case
+from latticebench.systems.errors import InputError
+from latticebench.systems.files import write_text
+from latticebench.systems.terms import Term
 
 SCORES = (
     "e2", "einf", "spurious", "tpr", "bound", "forecast_error", "forecast_horizon", "residual", "conditioning",
@@ -266,7 +266,7 @@ def read_cases(path: Path) -> pd.DataFrame:
     """
     if path.is_dir():
         if (path / "store.json").is_file():
-            from bench.store import open_store
+            from latticebench.bench.store import open_store
 
             return cases(open_store(path).all())
         path = path / "cases.csv"

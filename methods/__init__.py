@@ -7,11 +7,11 @@ import pkgutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from systems.errors import InputError, unknown
-from systems.lattice import load_module
+from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.lattice import load_module
 
 if TYPE_CHECKING:
-    from methods.method import Method
+    from latticebench.methods.method import Method
 
 # What `latticebench fit` uses when no method is named.
 DEFAULT = "stlsq"

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from methods.derivatives import LOADS, takes
-from methods.method import Abilities, Fit
-from methods.regression import rows
-from systems.lattice import Library
-from systems.samples import Samples
+from latticebench.methods.engine.derivatives import LOADS, takes
+from latticebench.methods.engine.regression import rows
+from latticebench.methods.method import Abilities, Fit
+from latticebench.systems.lattice import Library
+from latticebench.systems.samples import Samples
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_type_hints
 
 import numpy as np
 
-from systems.errors import InputError, unknown
-from systems.lattice import Library, ghosts
-from systems.samples import Samples, SimulatedSamples
+from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.lattice import Library, ghosts
+from latticebench.systems.samples import Samples, SimulatedSamples
 
 if TYPE_CHECKING:
     from jaxtyping import Float

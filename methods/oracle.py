@@ -12,11 +12,11 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from methods.derivatives import LOADS
-from methods.method import Abilities, Fit, Skipped
-from methods.regression import Regression, assemble, rows
-from systems.lattice import Library
-from systems.samples import Samples, SimulatedSamples
+from latticebench.methods.engine.derivatives import LOADS
+from latticebench.methods.engine.regression import Regression, assemble, rows
+from latticebench.methods.method import Abilities, Fit, Skipped
+from latticebench.systems.lattice import Library
+from latticebench.systems.samples import Samples, SimulatedSamples
 
 
 @dataclass(frozen=True)

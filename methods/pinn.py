@@ -33,11 +33,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from methods.method import Abilities, Fit, History
-from systems.errors import InputError
-from systems.lattice import Ends, Library, evaluate, ghosts, observed
-from systems.samples import Samples
-from systems.terms import Slot, real_parts
+from latticebench.methods.method import Abilities, Fit, History
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Ends, Library, evaluate, ghosts, observed
+from latticebench.systems.samples import Samples
+from latticebench.systems.terms import Slot, real_parts
 
 if TYPE_CHECKING:
     import sympy

@@ -35,9 +35,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from methods.derivatives import DEGREE, differentiate
-from methods.method import Abilities, Fit, History, Skipped, Smooth
-from methods.pinn import (
+from latticebench.methods.engine.derivatives import DEGREE, differentiate
+from latticebench.methods.method import Abilities, Fit, History, Skipped, Smooth
+from latticebench.methods.pinn import (
     Diary,
     Equation,
     Scales,
@@ -52,9 +52,9 @@ from methods.pinn import (
     scales,
     spread,
 )
-from systems.errors import InputError
-from systems.lattice import Library, ghosts
-from systems.samples import Samples
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Library, ghosts
+from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
     from jaxtyping import Float

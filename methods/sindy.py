@@ -17,12 +17,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from methods.derivatives import LOADS, takes
-from methods.method import Abilities, Fit
-from methods.regression import Regression, rows
-from systems.errors import InputError, unknown
-from systems.lattice import Library
-from systems.samples import Samples
+from latticebench.methods.engine.derivatives import LOADS, takes
+from latticebench.methods.engine.regression import Regression, rows
+from latticebench.methods.method import Abilities, Fit
+from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.lattice import Library
+from latticebench.systems.samples import Samples
 
 
 def optimise(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> Any:

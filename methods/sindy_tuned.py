@@ -45,14 +45,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
-from methods.derivatives import KINDS, LOADS, differentiate, takes
-from methods.method import Abilities, Fit
-from methods.pinn import inputs
-from methods.regression import Regression, rows
-from methods.sindy import optimise
-from systems.errors import InputError, unknown
-from systems.lattice import Library, evaluate, observed
-from systems.samples import Samples
+from latticebench.methods.engine.derivatives import KINDS, LOADS, differentiate, takes
+from latticebench.methods.engine.regression import Regression, rows
+from latticebench.methods.method import Abilities, Fit
+from latticebench.methods.pinn import inputs
+from latticebench.methods.sindy import optimise
+from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.lattice import Library, evaluate, observed
+from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -26,11 +26,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from methods.method import Abilities, Fit, History, Smooth
-from methods.trajectory import LEAST_NOISE, Record, approach, prepare, smooth, without_halves
-from systems.lattice import Library
-from systems.samples import Samples
-from systems.sensitivity import Drive, split_parts
+from latticebench.methods.engine.sensitivity import Drive, split_parts
+from latticebench.methods.method import Abilities, Fit, History, Smooth
+from latticebench.methods.trajectory import LEAST_NOISE, Record, approach, prepare, smooth, without_halves
+from latticebench.systems.lattice import Library
+from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
     import scipy.sparse

@@ -29,14 +29,23 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from methods.derivatives import DEGREE, differentiate
-from methods.method import Abilities, Fit, History
-from methods.weak import LOADS, Weak
-from systems.errors import InputError
-from systems.lattice import Library
-from systems.samples import Samples
-from systems.sensitivity import Condensed, Drive, Dynamics, Factor, Stretches, Transition, condense, split_parts
-from systems.terms import Term
+from latticebench.methods.engine.derivatives import DEGREE, differentiate
+from latticebench.methods.engine.sensitivity import (
+    Condensed,
+    Drive,
+    Dynamics,
+    Factor,
+    Stretches,
+    Transition,
+    condense,
+    split_parts,
+)
+from latticebench.methods.method import Abilities, Fit, History
+from latticebench.methods.weak import LOADS, Weak
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Library
+from latticebench.systems.samples import Samples
+from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     from jaxtyping import Float

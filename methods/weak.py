@@ -38,13 +38,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from methods.method import Abilities, Fit
-from methods.regression import Regression
-from methods.sindy import sparse_fit
-from systems.errors import InputError
-from systems.lattice import Library, evaluate, ghosts, observed
-from systems.samples import Samples
-from systems.terms import partials
+from latticebench.methods.engine.regression import Regression
+from latticebench.methods.method import Abilities, Fit
+from latticebench.methods.sindy import sparse_fit
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Library, evaluate, ghosts, observed
+from latticebench.systems.samples import Samples
+from latticebench.systems.terms import partials
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from methods.method import Abilities, Fit
-from systems.lattice import Library
-from systems.samples import Samples
+from latticebench.methods.method import Abilities, Fit
+from latticebench.systems.lattice import Library
+from latticebench.systems.samples import Samples
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ import pkgutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from systems.errors import InputError, unknown
+from latticebench.systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
-    from systems.lattice import System
+    from latticebench.systems.lattice import System
 
 
 def names() -> list[str]:
@@ -32,7 +32,7 @@ def find(name: str, base: Path | None = None) -> System:
     Raises:
         InputError: there is no such system or file, or the file does not hold a sound system.
     """
-    from systems.lattice import load
+    from latticebench.systems.lattice import load
 
     if name.endswith((".py", ".toml")):
         return load((base or Path()) / name)

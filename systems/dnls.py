@@ -9,7 +9,7 @@ Complex field, first order, dimensionless; C = 1/h^2. It turns with the phase of
 Source: the paper, equation (2) and Table 1; libraries (22)-(24), every coefficient complex.
 """
 
-from systems.lattice import Initial, System, library
+from latticebench.systems.lattice import Initial, System, library
 
 NEIGHBOURS = "u[n+1]; u[n-1]; u[n]; abs(u[n])**2*u[n]"
 TEN = (

@@ -19,8 +19,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args
 
-from systems.errors import InputError, unknown
-from systems.terms import TermError, check
+from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.terms import TermError, check
 
 Acts = Literal[
     "everywhere", "harmonic", "pulse", "delayed", "long range", "alternating", "one site", "one equation", "every site",
@@ -133,7 +133,7 @@ def load(path: Path) -> tuple[Effect, ...]:
     Raises:
         InputError: the file is missing or an entry is unsound; the text names the file and the entry.
     """
-    from systems.toml import read_toml
+    from latticebench.systems.toml import read_toml
 
     content = read_toml(path)
     for key in content:

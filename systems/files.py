@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from systems.errors import InputError
+from latticebench.systems.errors import InputError
 
 
 @contextlib.contextmanager

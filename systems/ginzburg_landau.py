@@ -8,8 +8,8 @@ pumps, the coupling and the cubic term damp. The initial state is a Nozaki-Bekki
 Source: the paper, equation (4) and Table 1; the libraries are those of the DNLS lattice, every coefficient complex.
 """
 
-from systems.dnls import LIBRARIES
-from systems.lattice import Initial, System, library
+from latticebench.systems.dnls import LIBRARIES
+from latticebench.systems.lattice import Initial, System, library
 
 SYSTEM = System(
     name="ginzburg-landau",

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from systems.errors import InputError, unknown
-from systems.terms import (
+from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.terms import (
     FUNCTIONS,
     Slot,
     Term,
@@ -577,7 +577,7 @@ def load_module(path: Path) -> Any:
 
 
 def _from_toml(path: Path) -> System:
-    from systems.toml import read_toml
+    from latticebench.systems.toml import read_toml
 
     content = read_toml(path)
     fields = (

@@ -10,7 +10,7 @@ change under u -> -u, n -> -n and t -> -t. On free, fixed, periodic and antiperi
 Source: the paper, equation (1) and Table 1; libraries (18)-(21).
 """
 
-from systems.lattice import Initial, System, library
+from latticebench.systems.lattice import Initial, System, library
 
 NEIGHBOURS = "u[n+1]; u[n-1]; u[n]; u[n]**3"
 

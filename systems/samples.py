@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from systems.errors import InputError, unknown
-from systems.files import whole
-from systems.lattice import Ends, Library
-from systems.terms import Term, express
+from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.files import whole
+from latticebench.systems.lattice import Ends, Library
+from latticebench.systems.terms import Term, express
 
 if TYPE_CHECKING:
     import pandas

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from systems.errors import InputError
-from systems.lattice import Ends, Integrator, Motion, System, motion
-from systems.samples import Samples, SimulatedSamples
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Ends, Integrator, Motion, System, motion
+from latticebench.systems.samples import Samples, SimulatedSamples
 
 if TYPE_CHECKING:
     from jaxtyping import Float

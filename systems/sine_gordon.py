@@ -10,7 +10,7 @@ t -> -t. On free, fixed and periodic chains it conserves the energy
 Source: the paper, equation (3) and Table 1; libraries (25)-(27).
 """
 
-from systems.lattice import Initial, System, library
+from latticebench.systems.lattice import Initial, System, library
 
 SYSTEM = System(
     name="sine-gordon",

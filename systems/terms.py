@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from systems.errors import InputError
+from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
     import sympy

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from systems.errors import InputError
+from latticebench.systems.errors import InputError
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-import methods
+from latticebench import methods
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 EXAMPLES = dict(re.findall(r"<!-- run by tests/test_readme.py -->\n```(\w+)\n(.*?)```", README, re.DOTALL))
@@ -28,7 +28,7 @@ def test_the_command_example_runs_from_top_to_bottom(tmp_path: Path) -> None:
     for line in EXAMPLES["sh"].strip().splitlines():
         program, *arguments = shlex.split(line)
         assert program == "latticebench"
-        command = [sys.executable, "-m", "bench.cli", *arguments]
+        command = [sys.executable, "-m", "latticebench", *arguments]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, f"{line}\n{done.stderr}"
     assert (tmp_path / "published" / "errors.md").exists()

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.tables import format_number
-from systems.files import write_text
+from latticebench.bench.tables import format_number
+from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent
 OWN = ("lib2", "four")

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.tables import format_number, read_cases, summary
-from systems.files import write_text
+from latticebench.bench.tables import format_number, read_cases, summary
+from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent
 LOST = 10.0

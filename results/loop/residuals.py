@@ -7,7 +7,7 @@ A specimen is a recording with one force that the declared equation lacks. Each 
 regressed on what each effect of the catalogue would add. Forces s(n, t) along the method's own state become columns R s by a linear
 map R of the method's own:
 
-    trajectory   r: what the shooting fit leaves of the readings, over the noise; R: what a force does to the readings (`bench.loop.tangent`)
+    trajectory   r: what the shooting fit leaves of the readings, over the noise; R: what a force does to the readings (`diagnosis.tangent`)
     weak         r: the weak equations' residual; R: integrals over the test functions; both whitened by the covariance of the
                  weak equations
     splines,     r = d^order u/dt^order - F(u, v; xi) along the method's curves, and R = 1; means of both over stretches of time,
@@ -16,7 +16,7 @@ map R of the method's own:
 The stretches are one correlation time of r long, dt (1 + 2 sum of the autocorrelation up to its first zero), pooled over the sites; the first
 and the last are left out, since derivatives are worst at the ends. Correlations between sites are not seen to.
 
-Everything else is the same for all (`bench.loop.trace`): the ways in which an effect may be there; the columns of the declared terms are
+Everything else is the same for all (`diagnosis.trace`): the ways in which an effect may be there; the columns of the declared terms are
 projected out; with U an orthonormal basis of a way's columns and nu the rows less the declared terms (and, for the trajectory,
 the start), the gain is -nu ln(1 - |U^T r|^2 / |r|^2), twice the log likelihood ratio with the noise's size fitted; the evidence is -ln of the
 tail of chi squared at the gain, less the cost of the search, and ranks the effects.
@@ -37,22 +37,22 @@ import pandas as pd
 from numpy import ndarray
 from scipy.stats import binomtest
 
-import methods
-import systems
-from bench.loop import faults, specimen, trace
-from bench.loop.model import Fitted, Model, first_fit
-from bench.loop.tangent import Path, Tangent, forces, linearise, orthonormal
-from bench.loop.trial import OFF_SIZE
-from bench.provenance import origin
-from bench.tables import format_number
-from methods.method import Smooth, solve
-from methods.trajectory import Solution, State
-from methods.weak import ACCURACY, Weak, WeakForm, estimate, linearised
-from systems.effects import CATALOGUE, INSTRUMENT, find
-from systems.errors import InputError
-from systems.files import write_text
-from systems.lattice import System
-from systems.samples import Samples
+from latticebench import methods, systems
+from latticebench.bench.provenance import origin
+from latticebench.bench.tables import format_number
+from latticebench.bench.trials import faults, specimen
+from latticebench.bench.trials.trial import OFF_SIZE
+from latticebench.diagnosis import trace
+from latticebench.diagnosis.model import Fitted, Model, first_fit
+from latticebench.diagnosis.tangent import Path, Tangent, forces, linearise, orthonormal
+from latticebench.methods.method import Smooth, solve
+from latticebench.methods.trajectory import Solution, State
+from latticebench.methods.weak import ACCURACY, Weak, WeakForm, estimate, linearised
+from latticebench.systems.effects import CATALOGUE, INSTRUMENT, find
+from latticebench.systems.errors import InputError
+from latticebench.systems.files import write_text
+from latticebench.systems.lattice import System
+from latticebench.systems.samples import Samples
 
 HERE = File(__file__).parent
 SYSTEMS = ("phi4", "sine-gordon", "dnls", "ginzburg-landau")

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.case import exact_regression, samples
-from bench.provenance import describe, lines
-from bench.store import open_store
-from bench.suite import Case, load
-from bench.tables import cases, format_number
-from systems.files import write_text
+from latticebench.bench.case import exact_regression, samples
+from latticebench.bench.provenance import describe, lines
+from latticebench.bench.store import open_store
+from latticebench.bench.suite import Case, load
+from latticebench.bench.tables import cases, format_number
+from latticebench.systems.files import write_text
 
 RIGHT = 0.05
 # A learning curve has arrived when its error stays below this.

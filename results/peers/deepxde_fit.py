@@ -28,16 +28,15 @@ os.environ["DDE_BACKEND"] = "pytorch"
 import numpy as np
 import pandas as pd
 
-import methods
-import systems
-from bench.provenance import origin
-from bench.tables import render
-from methods.method import make, solve
-from methods.pinn import PINN, scales
-from systems.files import write_text
-from systems.lattice import Library
-from systems.samples import Samples
-from systems.simulate import simulate
+from latticebench import methods, systems
+from latticebench.bench.provenance import origin
+from latticebench.bench.tables import render
+from latticebench.methods.method import make, solve
+from latticebench.methods.pinn import PINN, scales
+from latticebench.systems.files import write_text
+from latticebench.systems.lattice import Library
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import simulate
 
 SEED, GOOD = 1, 0.01
 

@@ -36,9 +36,9 @@ os.environ["DDE_BACKEND"] = "pytorch"
 
 import numpy as np
 
-import systems
-from methods.pinn import PINN
-from systems.simulate import simulate
+from latticebench import systems
+from latticebench.methods.pinn import PINN
+from latticebench.systems.simulate import simulate
 
 if TYPE_CHECKING:
     import torch

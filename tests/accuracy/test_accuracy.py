@@ -13,11 +13,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from bench.compare import compare
-from bench.run import run
-from bench.store import create
-from bench.suite import load
-from bench.tables import cases, read_cases
+from latticebench.bench.compare import compare
+from latticebench.bench.run import run
+from latticebench.bench.store import create
+from latticebench.bench.suite import load
+from latticebench.bench.tables import cases, read_cases
 
 BASELINE = Path(__file__).parent / "baseline.csv"
 FACTOR = 2.0

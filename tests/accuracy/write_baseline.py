@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from bench.provenance import describe
-from bench.store import open_store
-from bench.tables import cases, render
-from systems.files import write_text
+from latticebench.bench.provenance import describe
+from latticebench.bench.store import open_store
+from latticebench.bench.tables import cases, render
+from latticebench.systems.files import write_text
 
 KEPT = ["data", "library", "method", "noise", "seed", "status", "e2", "residual", "identity"]
 

@@ -15,7 +15,7 @@ SHARED = Path(__file__).parents[3] / "shared" / "data" / "measured"
 
 
 def latticebench(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "error", "-m", "bench.cli", *map(str, arguments)]
+    command = [sys.executable, "-W", "error", "-m", "latticebench", *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, timeout=300)
 
 

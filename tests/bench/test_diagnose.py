@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import systems
-from bench import cli
-from bench.loop.specimen import make
-from systems.samples import Samples, read, write
+from latticebench import systems
+from latticebench.bench import cli
+from latticebench.bench.trials.specimen import make
+from latticebench.systems.samples import Samples, read, write
 
 SYSTEM = """
 name = "mine"

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from bench.case import blank
-from bench.figures import draw_all, error_against_noise, panel
-from bench.suite import Case
+from latticebench.bench.case import blank
+from latticebench.bench.figures import draw_all, error_against_noise, panel
+from latticebench.bench.suite import Case
 
 
 def learned() -> dict[str, object]:

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-import systems
-from bench.limit import Limit, bound, bound_along, bound_of, bound_of_fit, denser, design
-from methods.method import solve
-from methods.trajectory import Trajectory
-from systems.errors import InputError
-from systems.lattice import library
-from systems.samples import Samples
-from systems.simulate import observe, sample_times, simulate
+from latticebench import systems
+from latticebench.bench.limit import Limit, bound, bound_along, bound_of, bound_of_fit, denser, design
+from latticebench.methods.method import solve
+from latticebench.methods.trajectory import Trajectory
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import observe, sample_times, simulate
 
 
 def spread(name, candidates, noise, seeds, velocities):
@@ -89,7 +89,7 @@ def test_a_thousand_sites():
 
 
 def test_sparse_and_dense_algebra_agree(monkeypatch):
-    import systems.sensitivity as sensitivity
+    from latticebench.methods.engine import sensitivity
 
     system = systems.find("phi4")
     one = system.library("lib2")

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from bench import cli, recordings
-from bench.recordings import RECORDINGS, Recording, find, fingerprint, take
-from systems.errors import InputError
-from systems.samples import read
+from latticebench.bench import cli, recordings
+from latticebench.bench.recordings import RECORDINGS, Recording, find, fingerprint, take
+from latticebench.systems.errors import InputError
+from latticebench.systems.samples import read
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "measured"
 

@@ -15,13 +15,13 @@ from typing import Any
 import psutil
 import pytest
 
-import systems
-from bench.case import run_case
-from bench.limit import bound
-from bench.run import run
-from bench.store import create
-from bench.suite import Case, Suite, load
-from systems.simulate import sample_times
+from latticebench import systems
+from latticebench.bench.case import run_case
+from latticebench.bench.limit import bound
+from latticebench.bench.run import run
+from latticebench.bench.store import create
+from latticebench.bench.suite import Case, Suite, load
+from latticebench.systems.simulate import sample_times
 
 HERE = Path(__file__).parent
 posix = pytest.mark.skipif(os.name != "posix", reason="sends POSIX signals")
@@ -114,7 +114,7 @@ def test_the_number_of_jobs_changes_no_digit(tmp_path: Path) -> None:
 
 
 def start_run(suite: Path, store: Path, jobs: int = 2) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "bench.cli", "run", str(suite), "--results", str(store), "--jobs", str(jobs)]
+    command = [sys.executable, "-m", "latticebench", "run", str(suite), "--results", str(store), "--jobs", str(jobs)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
 
 

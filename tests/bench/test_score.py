@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import systems
-from bench.score import forecast, score
-from systems.lattice import motion
-from systems.simulate import sample_times, simulate
+from latticebench import systems
+from latticebench.bench.score import forecast, score
+from latticebench.systems.lattice import motion
+from latticebench.systems.simulate import sample_times, simulate
 
 ONES = np.ones(4)
 

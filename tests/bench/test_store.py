@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from bench.case import blank
-from bench.store import RESULT, VERSION, create, open_store
-from bench.suite import Case
-from systems.errors import InputError
+from latticebench.bench.case import blank
+from latticebench.bench.store import RESULT, VERSION, create, open_store
+from latticebench.bench.suite import Case
+from latticebench.systems.errors import InputError
 
 
 def result(**more: Any) -> dict[str, Any]:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.suite import load, names
-from systems.errors import InputError
+from latticebench.bench.suite import load, names
+from latticebench.systems.errors import InputError
 
 SUITE = """
 title = "two by two"
@@ -100,7 +100,7 @@ METHOD = '''
 from dataclasses import dataclass
 from typing import ClassVar
 import numpy as np
-from methods.method import Abilities, Fit
+from latticebench.methods.method import Abilities, Fit
 
 @dataclass(frozen=True)
 class Ones:

@@ -9,12 +9,22 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from bench.case import blank
-from bench.compare import compare
-from bench.provenance import describe, origin
-from bench.suite import Case
-from bench.tables import cases, coefficients, format_number, limits, matrix, publish, read_cases, render, summary
-from systems.errors import InputError
+from latticebench.bench.case import blank
+from latticebench.bench.compare import compare
+from latticebench.bench.provenance import describe, origin
+from latticebench.bench.suite import Case
+from latticebench.bench.tables import (
+    cases,
+    coefficients,
+    format_number,
+    limits,
+    matrix,
+    publish,
+    read_cases,
+    render,
+    summary,
+)
+from latticebench.systems.errors import InputError
 
 ORIGIN = origin()
 
@@ -145,7 +155,7 @@ def test_what_is_published_can_be_read_and_carries_where_it_comes_from(tmp_path:
 def test_a_table_can_be_published_alone_and_a_long_one_for_programs_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bench.tables.MOST_READ", len(RESULTS) - 1)
+    monkeypatch.setattr("latticebench.bench.tables.MOST_READ", len(RESULTS) - 1)
     paths = publish(RESULTS, ABOUT, tmp_path, ["cases", "errors"])
     assert [path.name for path in paths] == ["cases.csv", "errors.csv", "errors.md", "errors.tex"]
 

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-import methods
-import systems
-from methods.method import Abilities, Fit, Skipped, make, settings, solve
-from systems.errors import InputError
-from systems.lattice import Library, library
-from systems.samples import Samples, SimulatedSamples
-from systems.sensitivity import split_parts
-from systems.simulate import observe, sample_times, simulate
+from latticebench import methods, systems
+from latticebench.methods.engine.sensitivity import split_parts
+from latticebench.methods.method import Abilities, Fit, Skipped, make, settings, solve
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Library, library
+from latticebench.systems.samples import Samples, SimulatedSamples
+from latticebench.systems.simulate import observe, sample_times, simulate
 
 # Settings that make a slow method fast enough for a test; what it finds is not judged here.
 QUICK = {

@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-import systems
-from methods.method import make, solve
-from methods.pinn import (
+from latticebench import systems
+from latticebench.methods.method import make, solve
+from latticebench.methods.pinn import (
     PINN,
     Problem,
     best_member,
@@ -25,11 +25,11 @@ from methods.pinn import (
     spread,
     workspace,
 )
-from methods.pinn_vp import PINNVP
-from systems.errors import InputError
-from systems.lattice import Library, library
-from systems.samples import Samples
-from systems.simulate import sample_times, simulate
+from latticebench.methods.pinn_vp import PINNVP
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Library, library
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import sample_times, simulate
 
 FEW = {"layers": 2, "width": 12, "collocation": 41}
 

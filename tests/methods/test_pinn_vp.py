@@ -3,15 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import systems
-from methods import pinn_vp
-from methods.method import Skipped, make, solve
-from methods.pinn import member_draws, scales
-from methods.pinn_vp import PINNVP, Algebra, Curve, hidden, step
-from systems.errors import InputError
-from systems.lattice import library
-from systems.samples import Samples
-from systems.simulate import observe, sample_times, simulate
+from latticebench import systems
+from latticebench.methods import pinn_vp
+from latticebench.methods.method import Skipped, make, solve
+from latticebench.methods.pinn import member_draws, scales
+from latticebench.methods.pinn_vp import PINNVP, Algebra, Curve, hidden, step
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import observe, sample_times, simulate
 
 SMALL = {"width": 20, "collocation": 61}
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import methods
-import systems
-from methods.method import make, solve
-from methods.regression import Regression
-from methods.sindy import sparse_fit
-from systems.errors import InputError
-from systems.samples import Samples
-from systems.simulate import simulate
+from latticebench import methods, systems
+from latticebench.methods.engine.regression import Regression
+from latticebench.methods.method import make, solve
+from latticebench.methods.sindy import sparse_fit
+from latticebench.systems.errors import InputError
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import simulate
 
 
 @pytest.fixture(scope="module")

@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import methods
-import systems
-from methods.method import make, solve
-from methods.regression import Regression
-from methods.sindy import sparse_fit
-from methods.sindy_tuned import OPTIMIZERS, SINDyTuned, options, path, triangular, windows
-from systems.errors import InputError
-from systems.lattice import library
-from systems.samples import Samples
-from systems.simulate import observe, sample_times, simulate
+from latticebench import methods, systems
+from latticebench.methods.engine.regression import Regression
+from latticebench.methods.method import make, solve
+from latticebench.methods.sindy import sparse_fit
+from latticebench.methods.sindy_tuned import OPTIMIZERS, SINDyTuned, options, path, triangular, windows
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import observe, sample_times, simulate
 
 OWN = {"phi4": "lib2", "dnls": "four", "ginzburg-landau": "four", "sine-gordon": "sines"}
 

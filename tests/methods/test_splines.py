@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import systems
-from bench.limit import bound
-from methods.method import solve
-from methods.splines import Splines, _curves, _equation
-from methods.trajectory import prepare
-from systems.simulate import observe, sample_times, simulate
+from latticebench import systems
+from latticebench.bench.limit import bound
+from latticebench.methods.method import solve
+from latticebench.methods.splines import Splines, _curves, _equation
+from latticebench.methods.trajectory import prepare
+from latticebench.systems.simulate import observe, sample_times, simulate
 
 FOUR = [("phi4", "lib2"), ("sine-gordon", "lib2"), ("dnls", "four"), ("ginzburg-landau", "four")]
 EXACT = [

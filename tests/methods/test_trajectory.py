@@ -9,14 +9,14 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
-import systems
-from bench.limit import bound
-from methods.method import solve
-from methods.trajectory import Trajectory, guess, maximise, prepare
-from systems.lattice import library
-from systems.samples import Samples
-from systems.sensitivity import Drive, Dynamics, Stretches
-from systems.simulate import observe, sample_times, simulate
+from latticebench import systems
+from latticebench.bench.limit import bound
+from latticebench.methods.engine.sensitivity import Drive, Dynamics, Stretches
+from latticebench.methods.method import solve
+from latticebench.methods.trajectory import Trajectory, guess, maximise, prepare
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import observe, sample_times, simulate
 
 FOUR = [("phi4", "lib2"), ("sine-gordon", "lib2"), ("dnls", "four"), ("ginzburg-landau", "four")]
 EXACT = [
@@ -219,7 +219,7 @@ def test_where_the_weak_form_gives_no_start_pieces_lead_to_the_same_fit(monkeypa
     one = systems.find("phi4").library("lib2")
     samples = seen("phi4", 0.01, 0)
     usual = solve(Trajectory(), [samples], one, 2, 0)
-    monkeypatch.setattr("methods.trajectory.from_weak_form", lambda *_: None)
+    monkeypatch.setattr("latticebench.methods.trajectory.from_weak_form", lambda *_: None)
     other = solve(Trajectory(), [samples], one, 2, 0)
     assert np.max(np.abs(other.coefficients - usual.coefficients) / usual.stderr) < 0.01
     # Too few samples for a weak form.

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.special import gamma, jv
 
-import systems
-from methods.method import Fit
-from methods.regression import Regression
-from methods.weak import Weak, WeakForm, bumps, estimate, estimate_state, significant
-from systems.errors import InputError
-from systems.lattice import Library, library
-from systems.samples import Samples, SimulatedSamples
-from systems.simulate import observe, sample_times, simulate
+from latticebench import systems
+from latticebench.methods.engine.regression import Regression
+from latticebench.methods.method import Fit
+from latticebench.methods.weak import Weak, WeakForm, bumps, estimate, estimate_state, significant
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Library, library
+from latticebench.systems.samples import Samples, SimulatedSamples
+from latticebench.systems.simulate import observe, sample_times, simulate
 
 OSCILLATOR = library("oscillator", "u[n]; v[n]; u[n]**3")
 

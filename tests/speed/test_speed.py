@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-import methods
-import systems
-from methods.method import make, solve
-from systems.samples import Samples
-from systems.simulate import observe, simulate
+from latticebench import methods, systems
+from latticebench.methods.method import make, solve
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import observe, simulate
 
 FAST = [name for name in sorted(methods.registered()) if not methods.find(name)().abilities.truth]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from systems.effects import CATALOGUE, Effect, find, load
-from systems.errors import InputError
-from systems.lattice import evaluate
-from systems.terms import Term
+from latticebench.systems.effects import CATALOGUE, Effect, find, load
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import evaluate
+from latticebench.systems.terms import Term
 
 ISSUE = """
 damping quadratic-drag dry-friction onsite-linear onsite-quadratic onsite-cubic onsite-quintic constant-force drive

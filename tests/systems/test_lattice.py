@@ -6,10 +6,21 @@ import math
 import numpy as np
 import pytest
 
-import systems
-from systems.errors import InputError
-from systems.lattice import Initial, Library, System, evaluate, ghosts, library, load, load_module, motion, observed
-from systems.terms import Term, split
+from latticebench import systems
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import (
+    Initial,
+    Library,
+    System,
+    evaluate,
+    ghosts,
+    library,
+    load,
+    load_module,
+    motion,
+    observed,
+)
+from latticebench.systems.terms import Term, split
 
 ENDS = ("free", "fixed", "periodic", "antiperiodic")
 

@@ -16,9 +16,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from systems import files, samples
-from systems.errors import InputError
-from systems.samples import FORMATS, Samples, SimulatedSamples, read, read_all, write
+from latticebench.systems import files, samples
+from latticebench.systems.errors import InputError
+from latticebench.systems.samples import FORMATS, Samples, SimulatedSamples, read, read_all, write
 
 # Round trips ----------------------------------------------------------------------------------------------------------------
 
@@ -421,8 +421,8 @@ def test_a_full_disk_leaves_the_old_file_as_it_was(tmp_path, suffix):
         from pathlib import Path
         import numpy as np
         import pandas, pyarrow.parquet
-        from systems.errors import InputError
-        from systems.samples import Samples, write
+        from latticebench.systems.errors import InputError
+        from latticebench.systems.samples import Samples, write
         u = np.random.default_rng(0).normal(size=(3000, 5))
         resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
         try:
@@ -544,7 +544,7 @@ def test_mirroring_twice_gives_the_samples_back():
 
 
 def test_simulated_samples_derive_their_truth_and_observed_ones_have_none():
-    from systems.lattice import library
+    from latticebench.systems.lattice import library
 
     one = SimulatedSamples(T, U, sigma=0.3, equation="2*u[n+1]-u[n]**3", exact=Samples(T, U), rate=2 * U, noise=0.1)
     np.testing.assert_allclose(one.truth(library("own", "u[n]; u[n+1]; u[n]**3")), [0, 2, -1])

@@ -7,11 +7,11 @@ import pytest
 import scipy.linalg
 from scipy.integrate import solve_ivp
 
-import systems
-from systems.errors import InputError
-from systems.lattice import Initial, System, motion
-from systems.samples import Samples
-from systems.simulate import follow, integrate, noise_size, observe, runge_kutta, sample_times, simulate
+from latticebench import systems
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Initial, System, motion
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import follow, integrate, noise_size, observe, runge_kutta, sample_times, simulate
 
 ENDS = ("free", "fixed", "periodic", "antiperiodic")
 

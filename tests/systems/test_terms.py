@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.mathtext import MathTextParser
 
-import systems
-from systems.errors import InputError
-from systems.terms import (
+from latticebench import systems
+from latticebench.systems.errors import InputError
+from latticebench.systems.terms import (
     FUNCTIONS,
     MAX_LENGTH,
     MAX_OFFSET,

@@ -1,0 +1,1 @@
+"""What people and programs see of a diagnosis: text, JSON, and an HTML page."""

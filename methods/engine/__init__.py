@@ -1,0 +1,1 @@
+"""What methods share: dynamics with sensitivities, derivatives, regression."""

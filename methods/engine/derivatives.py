@@ -1,0 +1,187 @@
+"""Time derivatives of sampled fields, for the methods that regress on them.
+
+`smoothing-spline`: a quintic spline with a penalty on its fourth derivative, the weight chosen by generalised cross-validation
+over all sites together (Craven & Wahba, Numer. Math. 31, 377 (1979)); it interpolates where the data have no noise.
+`spline`: the interpolating quintic spline. Any other name is one of pysindy's: `FiniteDifference`,
+`SmoothedFiniteDifference`, or a kind of its `SINDyDerivative` (the package `derivative`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from latticebench.systems.errors import InputError, unknown
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+DEGREE = 5
+# A dense eigenvalue problem of this size takes about a second.
+MAX_COEFFICIENTS = 1000
+# The kinds of the derivative package; most need their options.
+KINDS = ("finite_difference", "kalman", "kernel", "savitzky_golay", "spectral", "spline", "trend_filtered")
+LOADS = ("pysindy", "scipy.interpolate", "scipy.linalg", "scipy.optimize")
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """A field and its first two time derivatives at the sample times, each (T, N)."""
+
+    value: Float[ndarray, "time sites"]
+    first: Float[ndarray, "time sites"]
+    second: Float[ndarray, "time sites"]
+
+
+def takes(kind: str) -> tuple[bool, bool]:
+    """Say whether a way of differentiating takes uneven times, and missing values."""
+    return kind in ("smoothing-spline", "spline", "FiniteDifference"), kind in ("smoothing-spline", "spline")
+
+
+def differentiate(
+    t: Float[ndarray, " time"],
+    field: Float[ndarray, "time sites"],
+    kind: str,
+    options: Mapping[str, Any] | None = None,
+) -> Smoothed:
+    """Differentiate each site's series twice.
+
+    Args:
+        t: times (T,).
+        field: (T, N), real or complex.
+        kind: the way, see the module.
+        options: further arguments for pysindy's ways.
+
+    Raises:
+        InputError: there is no such way, its options are wrong, or there are too few samples.
+    """
+    if np.iscomplexobj(field):
+        # A value of which one part is missing is missing.
+        whole = np.where(np.isnan(field), complex(np.nan, np.nan), field)
+        real, imaginary = (differentiate(t, part, kind, options) for part in (whole.real, whole.imag))
+        return Smoothed(
+            real.value + 1j * imaginary.value,
+            real.first + 1j * imaginary.first,
+            real.second + 1j * imaginary.second,
+        )
+    if kind not in ("smoothing-spline", "spline"):
+        return _pysindy(t, field, kind, options or {})
+    if options:
+        raise InputError(f"differentiation {kind!r} takes no options")
+    if not np.any(np.isnan(field)):
+        return _spline(t, field, smooth=kind == "smoothing-spline")
+    # With gaps every site has times of its own; a value that was not seen stays NaN.
+    result = Smoothed(*(np.full(field.shape, np.nan) for _ in range(3)))
+    for site in range(field.shape[1]):
+        seen = ~np.isnan(field[:, site])
+        if np.sum(seen) <= DEGREE:
+            continue
+        one = _spline(t[seen], field[seen, site : site + 1], smooth=kind == "smoothing-spline")
+        for target, source in (
+            (result.value, one.value),
+            (result.first, one.first),
+            (result.second, one.second),
+        ):
+            target[seen, site] = source[:, 0]
+    return result
+
+
+def _spline(t: ndarray, field: ndarray, *, smooth: bool) -> Smoothed:
+    from scipy.interpolate import BSpline, make_interp_spline
+
+    if len(t) <= DEGREE:
+        raise InputError(
+            f"a quintic spline needs at least {DEGREE + 1} samples, there are {len(t)}; "
+            "give more, or use --set differentiation=FiniteDifference"
+        )
+    # The fit lives on [0, 1], so that the penalty's size does not depend on the unit of time.
+    span = t[-1] - t[0]
+    x = (t - t[0]) / span
+    if smooth:
+        knots = _knots(x)
+        curve = BSpline(knots, _smoothing_coefficients(x, field, knots), DEGREE)
+    else:
+        curve = make_interp_spline(x, field, k=DEGREE)
+    return Smoothed(curve(x), curve(x, 1) / span, curve(x, 2) / span**2)
+
+
+def _knots(x: ndarray) -> ndarray:
+    """Knots of the interpolating quintic spline through (at most MAX_COEFFICIENTS of) the sample times."""
+    if len(x) > MAX_COEFFICIENTS:
+        x = x[np.linspace(0, len(x) - 1, MAX_COEFFICIENTS).round().astype(int)]
+    inner = x[DEGREE // 2 + 1 : -(DEGREE // 2 + 1)]
+    return np.concatenate([np.full(DEGREE + 1, x[0]), inner, np.full(DEGREE + 1, x[-1])])
+
+
+def _smoothing_coefficients(x: ndarray, field: ndarray, knots: ndarray) -> ndarray:
+    """Minimise |field - B c|^2 + weight * integral of (fourth derivative)^2, the weight by generalised cross-validation.
+
+    In the basis in which both terms are diagonal the hat matrix has the eigenvalues 1/(1 + weight d_k), so that one
+    eigenvalue problem serves all weights.
+    """
+    import scipy.linalg
+    from scipy.interpolate import BSpline
+    from scipy.optimize import minimize_scalar
+
+    basis = BSpline.design_matrix(x, knots, DEGREE)
+    count = basis.shape[1]
+    gram = np.asarray((basis.T @ basis).todense())
+    right = np.asarray(basis.T @ field)
+    # Two Gauss points a knot interval integrate the square of the fourth derivative, of degree 2, exactly.
+    points, weights = np.polynomial.legendre.leggauss(2)
+    edges = np.unique(knots)
+    middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
+    places = (middle[:, None] + half[:, None] * points).ravel()
+    bend = np.asarray(BSpline(knots, np.eye(count), DEGREE)(places, 4))
+    penalty = bend.T @ (bend * (half[:, None] * weights).ravel()[:, None])
+    d, modes = scipy.linalg.eigh(penalty, gram)
+    d = np.maximum(d, 0.0)
+    amplitude = modes.T @ right
+    outside = float(np.sum((field - basis @ (modes @ amplitude)) ** 2)) if count < len(x) else 0.0
+
+    def score(log_weight: float) -> float:
+        lost = 1 - 1 / (1 + np.exp(log_weight) * d)
+        return float(
+            np.log(np.sum((lost[:, None] * amplitude) ** 2) + outside + 1e-300)
+            - 2 * np.log((np.sum(lost) + len(x) - count) / len(x))
+        )
+
+    positive = d[d > 1e-12 * d[-1]]
+    grid = np.linspace(-np.log(positive[-1]) - 10, -np.log(positive[0]) + 10, 80)
+    best = int(np.argmin([score(value) for value in grid]))
+    bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
+    chosen = minimize_scalar(score, bounds=bounds, method="bounded").x
+    return np.asarray(modes @ (amplitude / (1 + np.exp(chosen) * d)[:, None]))
+
+
+def _pysindy(t: ndarray, field: ndarray, kind: str, options: Mapping[str, Any]) -> Smoothed:
+    import warnings
+
+    import pysindy
+
+    if len(t) < 3:
+        raise InputError(f"differentiation {kind!r} needs at least 3 samples, there are {len(t)}; give more")
+    if kind in ("FiniteDifference", "SmoothedFiniteDifference"):
+        make = getattr(pysindy, kind)
+    elif kind in KINDS:
+        make = pysindy.SINDyDerivative
+        options = {"kind": kind, **options}
+    else:
+        raise unknown(
+            "differentiation",
+            kind,
+            ["smoothing-spline", "spline", "FiniteDifference", "SmoothedFiniteDifference", *KINDS],
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            way = make(**options)
+            first = np.asarray(way(field, t))
+            second = np.asarray(make(**options)(first, t))
+    except Exception as error:
+        raise InputError(f"differentiation {kind!r} with {dict(options)}: {error}") from error
+    return Smoothed(field, first, second)
