@@ -181,7 +181,7 @@ def test_a_file_name_of_any_kind_does_no_harm(typed, folder: Path) -> None:  # t
 def test_help_loads_nothing_heavy() -> None:
     program = (
         "import sys; sys.argv = ['latticebench', *{command!r}]\n"
-        "from bench.cli import main\n"
+        "from latticebench.bench.cli import main\n"
         "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
         "heavy = {{'torch', 'pysindy', 'sympy', 'pandas', 'scipy', 'matplotlib', 'sklearn'}} & set(sys.modules)\n"
         "assert not heavy, heavy\n"

@@ -108,7 +108,7 @@ def test_a_full_disk_is_one_clear_line_and_leaves_nothing_half_written(tmp_path:
     store.put("old", {"status": "ok"})
     program = (
         "import resource, signal, sys; from pathlib import Path\n"
-        "from bench.store import open_store; from systems.errors import InputError\n"
+        "from latticebench.bench.store import open_store; from latticebench.systems.errors import InputError\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
         f"store = open_store(Path({str(store.folder)!r}))\n"
         "try:\n    store.put('new', {'x': 'y' * 10000})\n"

@@ -343,7 +343,7 @@ def test_a_system_from_a_python_file_is_found(tmp_path):
     path.write_text(
         "from __future__ import annotations\n"
         "from dataclasses import dataclass\n"
-        "from systems.lattice import Initial, System, library\n"
+        "from latticebench.systems.lattice import Initial, System, library\n"
         "@dataclass\nclass Notes:\n    text: str = 'a dataclass of the user'\n"
         "SYSTEM = System(name='rotor', title='rotor', equation='-K*i*u[n]', order=1, is_complex=True,\n"
         "    parameters={'K': 2.0}, initials={'one': Initial('1')}, libraries=(library('own', 'i*u[n]'),), source='here')\n"
@@ -444,7 +444,7 @@ def test_a_file_that_is_no_toml_is_named(tmp_path, content, words):
         (b"\xff\xfe", "SyntaxError"),
         (b"x = 1\n", "SYSTEM"),
         (b"SYSTEM = 3\n", "SYSTEM"),
-        (b"from systems.terms import Term\nTerm('q')\n", "unknown name 'q'"),
+        (b"from latticebench.systems.terms import Term\nTerm('q')\n", "unknown name 'q'"),
     ],
 )
 def test_each_mistake_in_a_python_file_is_one_error_that_names_it(tmp_path, content, words):
