@@ -1,0 +1,86 @@
+"""The program: its commands, and what becomes of an error.
+
+Each command is a file with a function whose parameters are its options, and `EPILOG`, the text below its help. Heavy packages are
+imported inside the function, so that `--help`, `list` and tab completion answer at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+
+import latticebench
+from latticebench.bench.cli import compare, data, diagnose, figures, fit, limit, listing, run, simulate, table
+from latticebench.systems.errors import InputError
+
+app = typer.Typer(
+    name="latticebench",
+    help="Find the equations of motion of nonlinear lattices from data, and measure how well each method does it.",
+    epilog="Start with:  latticebench run tiny    or    latticebench list systems",
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"latticebench {latticebench.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def program(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Find the equations of motion of nonlinear lattices from data, and measure how well each method does it."""
+
+
+app.command("list", epilog=listing.EPILOG)(listing.list_)
+app.command(epilog=simulate.EPILOG)(simulate.simulate)
+app.command(epilog=fit.EPILOG)(fit.fit)
+app.command(epilog=diagnose.EPILOG)(diagnose.diagnose)
+app.add_typer(data.app, name="data")
+app.command(epilog=run.EPILOG)(run.run)
+app.command(epilog=table.EPILOG)(table.table)
+app.command(epilog=figures.EPILOG)(figures.figures)
+app.command(epilog=compare.EPILOG)(compare.compare)
+app.command(epilog=limit.EPILOG)(limit.limit)
+
+
+def main() -> None:
+    """Run the command line; bad input is one line on standard error and exit code 2."""
+    try:
+        code = app(standalone_mode=False)
+    except InputError as error:
+        _complain(str(error))
+        code = 2
+    except typer.Abort:
+        code = 130
+    except KeyboardInterrupt:
+        code = 130
+    except BrokenPipeError:
+        # The reader (head, a pager) has seen enough; Python would complain once more on exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    except Exception as error:
+        # Usage errors of the command-line library; anything else is a fault of ours and keeps its traceback.
+        message: Callable[[], str] | None = getattr(error, "format_message", None)
+        if message is None:
+            raise
+        text = message().strip().splitlines()
+        if text:
+            _complain(f"{' '.join(text)} (see: latticebench --help)")
+        code = 2
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _complain(text: str) -> None:
+    print("error: " + " ".join(text.splitlines()), file=sys.stderr)

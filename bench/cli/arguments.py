@@ -1,0 +1,131 @@
+"""What the texts on the command line stand for: equations, numbers, cases; and how a failed fit is told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from latticebench.systems.errors import InputError, unknown
+
+if TYPE_CHECKING:
+    from latticebench.bench.suite import Case
+    from latticebench.systems.lattice import Library, System
+    from latticebench.systems.samples import Samples
+
+
+def asked(
+    system: str | None, library: str | None, terms: str | None, order: int | None
+) -> tuple[System | None, Library, int]:
+    """Make out which library and order --system, --library, --terms and --order ask for."""
+    from latticebench import systems
+    from latticebench.systems.lattice import library as make_library
+
+    known = None if system is None else systems.find(system)
+    if terms is not None and library is not None:
+        raise InputError("--terms and --library: give one of them")
+    if terms is not None:
+        candidates = make_library("terms", terms)
+    elif known is not None:
+        if library is None:
+            raise InputError(
+                f"--library: choose one of {', '.join(one.name for one in known.libraries)}, or give --terms"
+            )
+        candidates = known.library(library)
+    else:
+        raise InputError(
+            'give --system and --library, or --terms and --order, such as --terms "u[n+1]; u[n-1]; u[n]" --order 2'
+        )
+    if order is None:
+        if known is None:
+            raise InputError("--order: 1 for du/dt, 2 for the second derivative")
+        order = known.order
+    return known, candidates, order
+
+
+def case_of(**given: Any) -> Case:
+    """Check what describes simulated samples."""
+    import pydantic
+
+    from latticebench.bench.suite import Case
+
+    try:
+        return Case(**{"library": "", "label": "", "method": "", **given})
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"--{first['loc'][0]}: {first['msg'].lower()}, it is {first['input']!r}") from None
+
+
+def pairs(given: Sequence[str] | None) -> dict[str, str]:
+    """Read NAME=VALUE pairs.
+
+    Raises:
+        InputError: a text is no such pair.
+    """
+    pairs = {}
+    for text in given or ():
+        name, equals, value = text.partition("=")
+        if not equals or not name.strip():
+            raise InputError(f"--set {text!r}: write NAME=VALUE, such as --set threshold=0.1")
+        pairs[name.strip()] = value.strip()
+    return pairs
+
+
+def numbers(given: Sequence[str] | None) -> dict[str, float]:
+    """Read NAME=VALUE pairs whose values are finite numbers.
+
+    Raises:
+        InputError: a value is no finite number.
+    """
+    numbers = {}
+    for name, value in pairs(given).items():
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            numbers[name] = math.nan
+        if not math.isfinite(numbers[name]):
+            raise InputError(f"--set {name}={value}: {value!r} is not a number")
+    return numbers
+
+
+def selected(only: Sequence[str] | None, names: Sequence[str], kind: str) -> Sequence[str]:
+    """Take all names, or those that --only gives."""
+    for name in only or ():
+        if name not in names:
+            raise unknown(kind, name, names, "--only")
+    return only or names
+
+
+@contextmanager
+def told(data: Sequence[Samples], method: str | None, what: str) -> Iterator[None]:
+    """Say in one line why nothing came of a fit.
+
+    Raises:
+        InputError: it was skipped, or it failed.
+    """
+    from latticebench.methods.method import Skipped
+
+    try:
+        yield
+    except Skipped as reason:
+        if method is None:
+            raise InputError(f"{data[0].source}: {reason}") from None
+        raise InputError(
+            f"method {method!r} cannot fit {data[0].source}: {reason}; choose another with --method"
+        ) from None
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{data[0].source}: {what} failed: {type(error).__name__}: {error}") from error
+
+
+def jsonable(value: Any) -> Any:
+    """Put None for NaN and texts for infinities, which JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: jsonable(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
+    return value

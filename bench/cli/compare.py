@@ -1,0 +1,43 @@
+"""`latticebench compare`: judge one run by another."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from latticebench.bench.cli.arguments import jsonable
+
+EPILOG = "Example:  latticebench compare results/default runs/default"
+
+
+def compare(
+    old: Annotated[Path, typer.Argument(help="A store, a folder with cases.csv, or a cases.csv.")],
+    new: Annotated[Path, typer.Argument(help="The same, to be judged.")],
+    factor: Annotated[float, typer.Option(min=1.0, help="An error that grew beyond this factor is a loss.")] = 2.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
+) -> None:
+    """Say which cases got better or worse; exit code 1 when any got worse."""
+    from latticebench.bench.compare import compare as compare_tables
+    from latticebench.bench.tables import read_cases
+
+    found = compare_tables(read_cases(old), read_cases(new), factor)
+    if as_json:
+        rows = {"worse": found.worse.to_dict("records"), "better": found.better.to_dict("records")}
+        rest = {"same": found.same, "gone": found.gone, "new": found.fresh}
+        print(json.dumps({**jsonable(rows), **rest}, indent=2))
+    else:
+        for name, frame in (("worse", found.worse), ("better", found.better)):
+            for _, row in frame.iterrows():
+                print(f"{name}: {row['case']}: E2 {row['old']} -> {row['new']}")
+        for name in found.gone:
+            print(f"gone: {name}")
+        for name in found.fresh:
+            print(f"new: {name}")
+        print(
+            f"{len(found.worse)} worse, {len(found.better)} better, {found.same} the same (within a factor of {factor:g})"
+        )
+    if len(found.worse):
+        raise typer.Exit(1)

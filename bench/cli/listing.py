@@ -1,0 +1,93 @@
+"""`latticebench list`: name what there is."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any, Literal
+
+import typer
+
+from latticebench.bench.cli.options import suite_files
+
+Kind = Literal["systems", "libraries", "methods", "suites", "effects"]
+
+EPILOG = "Example:  latticebench list libraries --json"
+
+
+def list_(
+    kind: Annotated[Kind, typer.Argument(help="What to list.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
+) -> None:
+    """Say what there is."""
+    from latticebench.bench.screen import show_rows
+
+    makers = {
+        "systems": _system_rows, "libraries": _library_rows, "methods": _method_rows, "suites": _suite_rows,
+        "effects": _effect_rows,
+    }  # fmt: skip
+    rows = makers[kind]()
+    if as_json:
+        print(json.dumps(rows, indent=2))
+        return
+    show_rows(list(rows[0]), [list(row.values()) for row in rows])
+
+
+def _system_rows() -> list[dict[str, Any]]:
+    from latticebench import systems
+
+    rows = []
+    for name in systems.names():
+        system = systems.find(name)
+        rows.append(
+            {
+                "name": name, "equation": f"u{chr(39) * system.order} = {system.equation}",
+                "field": "complex" if system.is_complex else "real", "parameters": dict(system.parameters),
+                "initial states": list(system.initials), "ends": system.ends, "sites": system.sites, "source": system.source,
+            }
+        )  # fmt: skip
+    return rows
+
+
+def _library_rows() -> list[dict[str, Any]]:
+    from latticebench import systems
+
+    return [
+        {
+            "system": name,
+            "library": library.name,
+            "size": len(library.terms),
+            "terms": list(library.texts),
+            "source": library.source,
+        }
+        for name in systems.names()
+        for library in systems.find(name).libraries
+    ]
+
+
+def _method_rows() -> list[dict[str, Any]]:
+    from latticebench import methods
+    from latticebench.methods.method import settings
+
+    return [
+        {"name": name, "what it is": (kind.__doc__ or "").strip().splitlines()[0], "settings": settings(kind)}
+        for name, kind in methods.registered().items()
+    ]
+
+
+def _effect_rows() -> list[dict[str, Any]]:
+    from latticebench.systems.effects import CATALOGUE, HOW
+
+    return [
+        {
+            "name": one.name, "second order, real": next(iter(one.texts(2, False)), ""),
+            "first order, complex": next(iter(one.texts(1, True)), ""), "how it acts": HOW[one.acts],
+            "what gives it away": one.look_for, "source": one.source,
+        }
+        for one in CATALOGUE
+    ]  # fmt: skip
+
+
+def _suite_rows() -> list[dict[str, Any]]:
+    from latticebench.systems.toml import read_toml
+
+    return [{"name": path.stem, "what it is for": read_toml(path).get("title", "")} for path in suite_files()]

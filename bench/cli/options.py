@@ -1,0 +1,57 @@
+"""Options that several commands share, and what the shell completes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+AnyEnds = Literal["unknown", "free", "fixed", "periodic", "antiperiodic"]
+KnownEnds = Literal["free", "fixed", "periodic", "antiperiodic"]
+
+
+def complete_systems(incomplete: str) -> list[str]:
+    """Return the systems whose names begin with `incomplete`."""
+    from latticebench import systems
+
+    return [name for name in systems.names() if name.startswith(incomplete)]
+
+
+def complete_methods(incomplete: str) -> list[str]:
+    """Return the methods whose names begin with `incomplete`."""
+    from latticebench import methods
+
+    return [name for name in methods.registered() if name.startswith(incomplete)]
+
+
+def complete_suites(incomplete: str) -> list[str]:
+    """Return the suites whose names begin with `incomplete`."""
+    return [path.stem for path in suite_files() if path.stem.startswith(incomplete)]
+
+
+def complete_libraries(incomplete: str) -> list[str]:
+    """Return the libraries of all systems whose names begin with `incomplete`."""
+    from latticebench import systems
+
+    found = {library.name for name in systems.names() for library in systems.find(name).libraries}
+    return sorted(name for name in found if name.startswith(incomplete))
+
+
+def complete_recordings(incomplete: str) -> list[str]:
+    """Return the recordings whose names begin with `incomplete`."""
+    from latticebench.bench.recordings import RECORDINGS
+
+    return [one.name for one in RECORDINGS if one.name.startswith(incomplete)]
+
+
+def suite_files() -> list[Path]:
+    """Return the files of the suites that come with the package, by name."""
+    here = Path(__file__).parents[1]
+    return sorted((*here.glob("suites/*.toml"), *here.glob("trials/suites/*.toml")), key=lambda path: path.stem)
+
+
+SystemName = Annotated[
+    str, typer.Argument(help="A name from `list systems`, or a .py or .toml file.", autocompletion=complete_systems)
+]
+Settings = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="May be given several times.")]
