@@ -97,7 +97,8 @@ def show_limit(limit: Limit, design: Design, note: str) -> None:
 def show_results(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], title: str, value: str = "e2") -> None:
     """Print a run's results: one score by data and method, what went wrong, and where the figures come from."""
     from latticebench.bench.provenance import lines
-    from latticebench.bench.tables import cases, matrix
+    from latticebench.bench.publish import matrix
+    from latticebench.bench.tables import cases
 
     every = cases(results)
     screen = console()

@@ -1,33 +1,27 @@
-"""Tidy tables: one row a case, one row a coefficient, and a summary; as Markdown, CSV and LaTeX."""
+"""Tidy tables of results: one row per case, one row per coefficient, and a summary over seeds."""
 
 from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from latticebench.bench.provenance import lines
 from latticebench.bench.suite import Case
 from latticebench.systems.errors import InputError
-from latticebench.systems.files import write_text
-from latticebench.systems.terms import Term
 
 SCORES = (
     "e2", "einf", "spurious", "tpr", "bound", "forecast_error", "forecast_horizon", "residual", "conditioning",
     "seconds", "cpu_seconds", "peak_mib",
 )  # fmt: skip
-FORMATS = ("csv", "md", "tex")
 # Over fewer seeds a root-mean-square error says little.
 FEW = 3
 # Standard errors to each side of a 95 % interval.
 INTERVAL = 1.96
-TABLES = ("cases", "coefficients", "limits", "summary", "errors")
-MOST_READ = 1000
 # What a row of the matrix is about; a column of it is a method.
 ABOUT = ["part", "data", "library"]
 
@@ -156,108 +150,6 @@ def _efficiency(group: pd.DataFrame) -> float:
     return float(np.sqrt(np.mean(bound**2) / np.mean(e2**2)))
 
 
-def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
-    """Arrange the summary as part, data and library against method; a cell without a figure says why.
-
-    Beside errors stands their bound, where there is one.
-    """
-    short = summary(table)
-    if short.empty:
-        return pd.DataFrame(columns=ABOUT)
-    status = table.drop_duplicates([*ABOUT, "method"])["status"].tolist()
-
-    def shown(row: pd.Series, state: str) -> str:
-        figure = format_number(row[value])
-        if figure or state != "ok":
-            return figure or state
-        # Where the equation is outside the library, what it leaves of the derivative is all there is to say.
-        left = format_number(row["residual"])
-        return f"no truth, leaves {left}" if left else "no truth"
-
-    short["cell"] = [shown(row, state) for (_, row), state in zip(short.iterrows(), status, strict=True)]
-    wide = short.pivot(index=ABOUT, columns="method", values="cell")
-    rows = pd.MultiIndex.from_frame(short[ABOUT].drop_duplicates())
-    wide = wide.reindex(index=rows, columns=list(dict.fromkeys(short["method"]))).fillna("").reset_index()
-    wide.columns.name = None
-    if value == "e2" and short["bound"].notna().any():
-        floors = short.groupby(ABOUT, sort=False)["bound"].max()
-        wide["bound"] = [format_number(floors[tuple(row)]) for row in wide[ABOUT].itertuples(index=False)]
-    return _without_empty(wide)
-
-
-def _without_empty(frame: pd.DataFrame) -> pd.DataFrame:
-    """Leave the column of parts out where the suite has none."""
-    return frame.drop(columns="part") if "part" in frame and not frame["part"].astype(bool).any() else frame
-
-
-def format_number(value: Any) -> str:
-    """Write a number with two digits; nothing for NaN."""
-    if isinstance(value, str):
-        return value
-    if value is None or np.isnan(value):
-        return ""
-    if np.isinf(value):
-        return "inf"
-    return f"{value:.2g}" if 1e-3 <= abs(value) < 1e4 or value == 0 else f"{value:.1e}"
-
-
-def publish(
-    results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = TABLES
-) -> list[Path]:
-    """Write the tables, each as CSV, Markdown and LaTeX with its provenance.
-
-    A table without rows is left out; one of more than MOST_READ rows is for programs, and written as CSV alone.
-
-    Raises:
-        InputError: a file cannot be written.
-    """
-    table = cases(results)
-    made: dict[str, Callable[[], pd.DataFrame]] = {
-        "cases": lambda: table,
-        "coefficients": lambda: coefficients(results),
-        "limits": lambda: limits(results),
-        "summary": lambda: summary(table),
-        "errors": lambda: matrix(table),
-    }
-    written = []
-    for name in only:
-        frame = made[name]()
-        for form in FORMATS if len(frame) <= MOST_READ else FORMATS[:1]:
-            if frame.empty:
-                continue
-            path = folder / f"{name}.{form}"
-            write_text(path, render(frame, about, form))
-            written.append(path)
-    return written
-
-
-def render(frame: pd.DataFrame, about: Mapping[str, Any], form: str) -> str:
-    """Write a table as text: `csv` with all digits, `md` and `tex` to be read; the provenance stands at its head."""
-    head = lines(about)
-    if form == "csv":
-        return "".join(f"# {line}\n" for line in head) + frame.to_csv(index=False)
-    readable = _without_empty(frame.drop(columns=[name for name in ("identity", "settings") if name in frame]))
-    for name in readable.columns:
-        if pd.api.types.is_float_dtype(readable[name]):
-            readable[name] = [format_number(value) for value in readable[name]]
-    if form == "md":
-        quoted = readable.map(lambda value: str(value).replace("|", "\\|"))
-        if "term" in quoted:
-            quoted["term"] = [f"`{term}`" for term in quoted["term"]]
-        return quoted.to_markdown(index=False, disable_numparse=True) + "\n\n" + "".join(f"- {line}\n" for line in head)
-    if "term" in readable:
-        readable["term"] = [f"${Term(text).latex}$" for text in readable["term"]]
-    escaped = readable.map(lambda value: str(value) if str(value).startswith("$") else _tex(str(value)))
-    escaped.columns = pd.Index([_tex(str(name)) for name in escaped.columns])
-    body = " \\\\\n".join(" & ".join(row) for row in escaped.itertuples(index=False))
-    columns = "l" * len(escaped.columns)
-    return (
-        "".join(f"% {line}\n" for line in head)
-        + f"\\begin{{tabular}}{{{columns}}}\n\\hline\n"
-        + " & ".join(escaped.columns) + " \\\\\n\\hline\n" + body + " \\\\\n\\hline\n\\end{tabular}\n"
-    )  # fmt: skip
-
-
 def read_cases(path: Path) -> pd.DataFrame:
     """Read a published table of cases, or make it from a store.
 
@@ -293,11 +185,3 @@ def _number(value: Any) -> float:
 
 def _settings(given: Mapping[str, Any]) -> str:
     return ", ".join(f"{name}={value}" for name, value in given.items())
-
-
-def _tex(text: str) -> str:
-    table = {
-        "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
-        "^": r"\^{}", "~": r"\~{}", "|": r"\textbar{}",
-    }  # fmt: skip
-    return "".join(table.get(letter, letter) for letter in text)

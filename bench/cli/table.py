@@ -27,9 +27,10 @@ def table(
 ) -> None:
     """Show the results of a run as a table, and publish them."""
     from latticebench.bench.provenance import describe
+    from latticebench.bench.publish import TABLES, publish
     from latticebench.bench.screen import show_results
     from latticebench.bench.store import open_store
-    from latticebench.bench.tables import SCORES, TABLES, publish
+    from latticebench.bench.tables import SCORES
     from latticebench.bench.trials import scores
 
     if value not in SCORES:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from latticebench.bench.provenance import lines
-from latticebench.bench.tables import format_number
+from latticebench.bench.publish import format_number
 from latticebench.bench.trials.faults import BLIND, FIFTH_BLIND, FOURTH_BLIND, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND
 from latticebench.bench.trials.trial import is_right
 from latticebench.systems.errors import InputError

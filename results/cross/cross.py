@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from latticebench.bench.tables import format_number
+from latticebench.bench.publish import format_number
 from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent

@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from latticebench.bench.tables import format_number, read_cases, summary
+from latticebench.bench.publish import format_number
+from latticebench.bench.tables import read_cases, summary
 from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent

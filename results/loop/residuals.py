@@ -39,7 +39,7 @@ from scipy.stats import binomtest
 
 from latticebench import methods, systems
 from latticebench.bench.provenance import origin
-from latticebench.bench.tables import format_number
+from latticebench.bench.publish import format_number
 from latticebench.bench.trials import faults, specimen
 from latticebench.bench.trials.trial import OFF_SIZE
 from latticebench.diagnosis import trace

@@ -20,9 +20,10 @@ import pandas as pd
 
 from latticebench.bench.case import exact_regression, samples
 from latticebench.bench.provenance import describe, lines
+from latticebench.bench.publish import format_number
 from latticebench.bench.store import open_store
 from latticebench.bench.suite import Case, load
-from latticebench.bench.tables import cases, format_number
+from latticebench.bench.tables import cases
 from latticebench.systems.files import write_text
 
 RIGHT = 0.05

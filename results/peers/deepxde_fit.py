@@ -30,7 +30,7 @@ import pandas as pd
 
 from latticebench import methods, systems
 from latticebench.bench.provenance import origin
-from latticebench.bench.tables import render
+from latticebench.bench.publish import render
 from latticebench.methods.method import make, solve
 from latticebench.methods.pinn import PINN, scales
 from latticebench.systems.files import write_text

@@ -6,8 +6,9 @@ import sys
 from pathlib import Path
 
 from latticebench.bench.provenance import describe
+from latticebench.bench.publish import render
 from latticebench.bench.store import open_store
-from latticebench.bench.tables import cases, render
+from latticebench.bench.tables import cases
 from latticebench.systems.files import write_text
 
 KEPT = ["data", "library", "method", "noise", "seed", "status", "e2", "residual", "identity"]

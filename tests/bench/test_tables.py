@@ -12,18 +12,9 @@ import pytest
 from latticebench.bench.case import blank
 from latticebench.bench.compare import compare
 from latticebench.bench.provenance import describe, origin
+from latticebench.bench.publish import format_number, matrix, publish, render
 from latticebench.bench.suite import Case
-from latticebench.bench.tables import (
-    cases,
-    coefficients,
-    format_number,
-    limits,
-    matrix,
-    publish,
-    read_cases,
-    render,
-    summary,
-)
+from latticebench.bench.tables import cases, coefficients, limits, read_cases, summary
 from latticebench.systems.errors import InputError
 
 ORIGIN = origin()
@@ -152,10 +143,22 @@ def test_what_is_published_can_be_read_and_carries_where_it_comes_from(tmp_path:
     assert r"forecast\_error" in (tmp_path / "cases.tex").read_text()
 
 
+def test_a_latex_table_has_rules_of_booktabs_and_columns_of_siunitx() -> None:
+    frame = pd.DataFrame({"label_1": ["50 % & more", "b"], "E2": [-1.5e-9, 12.25], "a": ["0.3", "no truth"]})
+    table = render(frame, ABOUT, "tex")
+    head, rows = table[table.index(r"\begin{tabular}") :].split("\\midrule\n")
+    assert head == (
+        r"\begin{tabular}{lS[table-format=-2.1e-1]S[table-format=1.1]}" + "\n\\toprule\n"
+        r"{label\_1} & {E2} & {a} \\" + "\n"
+    )
+    assert rows.splitlines()[0] == r"50 \% \& more & -1.5e-9 & 0.3 \\"
+    assert rows.splitlines()[1:3] == [r"b & 12 & {no truth} \\", r"\bottomrule"]
+
+
 def test_a_table_can_be_published_alone_and_a_long_one_for_programs_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("latticebench.bench.tables.MOST_READ", len(RESULTS) - 1)
+    monkeypatch.setattr("latticebench.bench.publish.MOST_READ", len(RESULTS) - 1)
     paths = publish(RESULTS, ABOUT, tmp_path, ["cases", "errors"])
     assert [path.name for path in paths] == ["cases.csv", "errors.csv", "errors.md", "errors.tex"]
 
