@@ -29,7 +29,8 @@ from latticebench.bench.suite import Case
 from latticebench.methods.engine.regression import Regression, assemble
 from latticebench.methods.method import Fit, Skipped, make, solve
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Library, System, motion
+from latticebench.systems.lattice import Library, System
+from latticebench.systems.motion import motion
 from latticebench.systems.samples import Samples, SimulatedSamples
 from latticebench.systems.simulate import observe, sample_times, simulate
 
@@ -169,11 +170,11 @@ def samples(case: Case, base: Path) -> list[SimulatedSamples]:
     """Make a case's samples; they do not depend on its library or method."""
     clean = _simulated(
         case.system, _stamp(case.system, base), tuple(case.parameters.items()), case.initial, case.sites, case.ends,
-        case.integrator, case.samples, case.span, case.uneven, case.velocities, case.trajectories,
+        case.integrator, case.samples, case.span, case.uneven, case.trajectories,
         case.seed if case.uneven or case.trajectories > 1 else 0, base,
     )  # fmt: skip
     draw = np.random.default_rng(seed_of(case.seed, "noise"))
-    noisy = [observe(one, draw, noise=case.noise, missing=case.missing) for one in clean]
+    noisy = [observe(one, draw, noise=case.noise, missing=case.missing, velocities=case.velocities) for one in clean]
     if case.known_ends:
         system, _ = case.resolve(base)
         noisy = [replace(one, ends=case.ends or system.ends) for one in noisy]
@@ -197,7 +198,6 @@ def _simulated(
     count: int,
     span: float,
     uneven: bool,
-    velocities: bool,
     trajectories: int,
     seed: int,
     base: Path,
@@ -220,7 +220,6 @@ def _simulated(
                 initial=initial,
                 variation=vary,
                 integrator=integrator,
-                velocities=velocities,
             )
         )
     return made

@@ -23,9 +23,10 @@ import numpy as np
 
 from latticebench.methods.engine.sensitivity import Drive, Dynamics, Stretches, condense, split_parts
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Ends, Library, System
+from latticebench.systems.lattice import Library, System
 from latticebench.systems.samples import Samples, SimulatedSamples
 from latticebench.systems.simulate import noise_size, simulate
+from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -226,13 +227,11 @@ def bound(
     """
     chain: Ends = (ends or system.ends) if known_ends else "unknown"
     data = [
-        simulate(
-            system, parameters=parameters, sites=sites, times=times, ends=ends, initial=initial, variation=draw,
-            velocities=velocities,
-        )
+        simulate(system, parameters=parameters, sites=sites, times=times, ends=ends, initial=initial, variation=draw)
         for draw in variations
-    ]  # fmt: skip
-    return bound_of([replace(one, ends=chain) for one in data], library, system.order, noise=noise)
+    ]
+    seen = [replace(one, v=one.v if velocities else None, ends=chain) for one in data]
+    return bound_of(seen, library, system.order, noise=noise)
 
 
 def bound_of(data: Sequence[SimulatedSamples], library: Library, order: int, *, noise: float) -> Limit:

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Library, Motion
+from latticebench.systems.lattice import Library
+from latticebench.systems.motion import Motion
 from latticebench.systems.samples import Samples
 from latticebench.systems.simulate import follow
 from latticebench.systems.terms import combination

@@ -20,8 +20,9 @@ import numpy as np
 from latticebench.methods.engine.sensitivity import Factor
 from latticebench.methods.trajectory import Record, Solution, State, approach, guess, maximise, prepare, without_halves
 from latticebench.systems.effects import INSTRUMENT, Effect
-from latticebench.systems.lattice import Ends, Library
+from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
+from latticebench.systems.stencil import Ends
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:

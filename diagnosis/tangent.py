@@ -22,7 +22,7 @@ import numpy as np
 from latticebench.diagnosis.model import ACCURACY, Fitted, Force, rates, read_term
 from latticebench.methods.engine.sensitivity import Stretches, Transition
 from latticebench.methods.trajectory import Record, tolerances
-from latticebench.systems.lattice import Ends, evaluate
+from latticebench.systems.stencil import Ends, evaluate
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from latticebench.diagnosis.residual import of_dynamics
 from latticebench.diagnosis.tangent import Path, Tangent, force_along, forces, orthonormal
 from latticebench.systems.effects import Effect
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Ends
+from latticebench.systems.stencil import Ends
 from latticebench.systems.terms import Term, express
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.lattice import load_module
+from latticebench.systems.user_files import load_module
 
 if TYPE_CHECKING:
     from latticebench.methods.method import Method

@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_type_hints
 import numpy as np
 
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.lattice import Library, ghosts
+from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples, SimulatedSamples
+from latticebench.systems.stencil import ghosts
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -34,10 +34,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from latticebench.methods.method import Abilities, Fit, History
+from latticebench.systems.compiler import Slot, real_parts
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Ends, Library, evaluate, ghosts, observed
+from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
-from latticebench.systems.terms import Slot, real_parts
+from latticebench.systems.stencil import Ends, evaluate, ghosts, observed
 
 if TYPE_CHECKING:
     import sympy

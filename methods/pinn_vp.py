@@ -53,8 +53,9 @@ from latticebench.methods.pinn import (
     spread,
 )
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Library, ghosts
+from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
+from latticebench.systems.stencil import ghosts
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -51,8 +51,9 @@ from latticebench.methods.method import Abilities, Fit
 from latticebench.methods.pinn import inputs
 from latticebench.methods.sindy import optimise
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.lattice import Library, evaluate, observed
+from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
+from latticebench.systems.stencil import evaluate, observed
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -41,10 +41,11 @@ import numpy as np
 from latticebench.methods.engine.regression import Regression
 from latticebench.methods.method import Abilities, Fit
 from latticebench.methods.sindy import sparse_fit
+from latticebench.systems.compiler import partials
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Library, evaluate, ghosts, observed
+from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
-from latticebench.systems.terms import partials
+from latticebench.systems.stencil import evaluate, ghosts, observed
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

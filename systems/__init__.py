@@ -1,4 +1,8 @@
-"""What is studied: terms, lattices, samples, simulation, and one file a system."""
+"""What is studied: terms, lattices, samples, simulation, effects, and one file per system.
+
+"The paper" is S. Saqlain, W. Zhu, E. G. Charalampidis and P. G. Kevrekidis, Discovering Governing Equations in Discrete
+Systems Using PINNs; its equations, libraries, initial states and sampling are where the benchmark starts.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def names() -> list[str]:
-    """Name every system of this package: each module that has a `SYSTEM`."""
+    """Return the names of all systems of this package, one per module that defines `SYSTEM`."""
     return sorted(
         module.SYSTEM.name
         for info in pkgutil.iter_modules(__path__)
@@ -23,19 +27,19 @@ def names() -> list[str]:
 
 
 def find(name: str, base: Path | None = None) -> System:
-    """Look a system up by its name, or load it from a user's `.py` or `.toml` file.
+    """Return a system by its name, or load it from a user's `.py` or `.toml` file.
 
     Args:
         name: a name from `names()`, or the path of a file.
-        base: the folder that a relative path starts from; the working directory when None.
+        base: the folder that a relative path starts from; the working directory if None.
 
     Raises:
-        InputError: there is no such system or file, or the file does not hold a sound system.
+        InputError: there is no such system or file, or the file does not hold a valid system.
     """
-    from latticebench.systems.lattice import load
+    from latticebench.systems.user_files import load_system
 
     if name.endswith((".py", ".toml")):
-        return load((base or Path()) / name)
+        return load_system((base or Path()) / name)
     for info in pkgutil.iter_modules(__path__):
         system = getattr(importlib.import_module(f"{__name__}.{info.name}"), "SYSTEM", None)
         if system is not None and system.name == name:

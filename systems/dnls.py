@@ -1,12 +1,17 @@
 """The discrete nonlinear Schroedinger lattice (DNLS), focusing.
 
-    i u_n' = -C (u_{n+1} + u_{n-1} - 2 u_n) - |u_n|^2 u_n,   so   u_n' = i C (...) + i |u_n|^2 u_n
+    i u_n' = -C (u_{n+1} + u_{n-1} - 2 u_n) - |u_n|^2 u_n,   n = 1..N,
 
-Complex field, first order, dimensionless; C = 1/h^2. It turns with the phase of u and conserves the norm and the energy
+so that u_n' = i C (u_{n+1} + u_{n-1} - 2 u_n) + i |u_n|^2 u_n. Complex field, first order, dimensionless. Site n is
+entry n - 1 of an array. The ends are free: u_0 = u_1 and u_{N+1} = u_N. C = 1/h^2 with the lattice spacing h; initial
+states are functions of x_n, N points evenly spaced on [-N h/2, N h/2], both ends included.
 
-    P = sum_n |u_n|^2,   H = sum over bonds C |u_{n+1} - u_n|^2 - sum_n |u_n|^4 / 2
+The equation does not change when u is multiplied by a phase, exp(i a). It conserves the norm and the energy
 
-Source: the paper, equation (2) and Table 1; libraries (22)-(24), every coefficient complex.
+    P = sum_n |u_n|^2,   H = C sum over bonds |u_{n+1} - u_n|^2 - sum_n |u_n|^4 / 2
+
+Source: the paper (see `latticebench.systems`), equation (2) and Table 1; libraries (22)-(24), every coefficient
+complex.
 """
 
 from latticebench.systems.lattice import Initial, System, library
@@ -18,7 +23,7 @@ TEN = (
 )
 NINE = f"{NEIGHBOURS}; abs(u[n])**2; abs(u[n+1])**2; abs(u[n-1])**2; abs(u[n+1])**2*u[n+1]; abs(u[n-1])**2*u[n-1]"
 
-# The Ginzburg-Landau lattice has the same ones.
+# The Ginzburg-Landau lattice has the same libraries.
 LIBRARIES = (
     library("four", NEIGHBOURS, "paper, four complex terms", with_imaginary=True),
     library("ten", TEN, "paper, ten complex terms", with_imaginary=True),

@@ -1,48 +1,41 @@
 """The catalogue: pieces of physics and of measurement that a declared equation may lack.
 
-Each effect has a formula in the term language, a way of acting (a term at every site, at one site, in time; other ends; a sensor
-that does not show the field as it is), what to look for, and a source. Coefficients have no size here: data give them.
-
-A user's own catalogue is a TOML file with a table `[[effect]]` for each:
-
-    [[effect]]
-    name = "cubic-drag"
-    formula = "v[n]**3"
-    orders = [2]
-    look_for = "amplitudes that fall as one over the root of time"
+Each effect has a formula in the term language, a way of acting (a term at every site, at one site, in time; other
+ends; a sensor that distorts the field), a hint what to look for, and a source. The size of its coefficients is not
+part of it: that comes from data.
+Users add effects of their own in a TOML file (see `user_files.load_effects`).
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.terms import TermError, check
+from latticebench.systems.parser import TermError, parse
 
 Acts = Literal[
     "everywhere", "harmonic", "pulse", "delayed", "long range", "alternating", "one site", "one equation", "every site",
     "ends", "offset", "gain", "curve", "clock", "rounding",
 ]  # fmt: skip
-"""How an effect acts; `HOW` says what each means."""
+"""How an effect acts; `HOW` explains each way."""
 
 HOW: dict[Acts, str] = {
     "everywhere": "the formula, at every site and time",
     "harmonic": "the formula times cos(omega t) and sin(omega t), at every site alike; omega found",
     "pulse": "the formula times exp(-((t - at) / width)^2 / 2), at every site alike; at and width found",
-    "delayed": "the formula of the field as it was a delay before; delay found",
+    "delayed": "the formula of the field a delay earlier; delay found",
     "long range": "sum over r >= 2 of (u_{n+r} + u_{n-r} - 2 u_n) / r^s; s found",
     "alternating": "the formula with the sign (-1)^k at site k",
     "one site": "the formula at one site only; site found",
     "every site": "the formula at every site with a coefficient of its own",
     "one equation": "the whole right-hand side of one site is scaled; site found",
-    "ends": "the chain ends otherwise than declared",
-    "offset": "the reading is u + b; site found, or a b for each",
-    "gain": "the reading is g u; site found, or a g for each",
+    "ends": "the chain ends in another way than declared",
+    "offset": "the reading is u + b; at one site, which is found, or with a b for every site",
+    "gain": "the reading is g u; at one site, which is found, or with a g for every site",
     "curve": "the reading is u + c u^2",
-    "clock": "the times are not what they are said to be: scaled, or each a little off",
+    "clock": "the recorded times are wrong: all scaled, or each slightly off",
     "rounding": "the reading is a multiple of a step",
 }
 
@@ -55,18 +48,18 @@ class Effect:
 
     Attributes:
         name: what it is called.
-        formula: in the term language, for a second-order lattice and wherever the next two are None.
-        first_order: for a first-order lattice; "" where it makes no sense there.
-        complex_field: for a complex field; "" where it makes no sense there.
-        acts: how, see `HOW`.
-        real: for complex fields, the coefficient is real; otherwise it is complex: two real ones, of T and i*T.
-        orders: of the time derivative that it makes sense for.
-        takes: it only takes energy: the coefficient is negative.
-        look_for: what gives it away.
+        formula: in the term language; used wherever neither of the next two applies.
+        first_order: the formula on a first-order lattice; None if it is the same, "" if it has no meaning there.
+        complex_field: the formula on a complex field; None if it is the same, "" if it has no meaning there.
+        acts: the way of acting, see `HOW`.
+        real: whether the coefficient is real even on a complex field; otherwise it is two real ones, of T and i*T.
+        orders: of the time derivative for which the effect has a meaning.
+        takes: whether it only takes energy, so that its coefficient is negative.
+        look_for: what it shows in data.
         source: where to read about it.
 
     Raises:
-        InputError: the name or a formula is unsound.
+        InputError: the name, the way of acting or a formula is invalid.
     """
 
     name: str
@@ -93,12 +86,12 @@ class Effect:
         for text in (self.formula, self.first_order, self.complex_field):
             if text:
                 try:
-                    check(text)
+                    parse(text)
                 except TermError as error:
                     raise InputError(f"effect {self.name!r}: {error}") from None
 
     def texts(self, order: int, is_complex: bool) -> tuple[str, ...]:
-        """Give the terms for a lattice: one, or T and i*T where the coefficient is complex; none where it makes no sense."""
+        """Return the terms on a lattice: T, or T and i*T for a complex coefficient; none if it has no meaning there."""
         if order not in self.orders:
             return ()
         text = self.formula
@@ -116,64 +109,15 @@ class Effect:
 
 
 def find(name: str, catalogue: tuple[Effect, ...] | None = None) -> Effect:
-    """Look an effect up by its name.
+    """Return the effect of this name, from the built-in catalogue if none is given.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: there is none of this name.
     """
     for effect in catalogue or CATALOGUE:
         if effect.name == name:
             return effect
     raise unknown("effect", name, [effect.name for effect in catalogue or CATALOGUE])
-
-
-def load(path: Path) -> tuple[Effect, ...]:
-    """Read a user's own effects from a TOML file.
-
-    Raises:
-        InputError: the file is missing or an entry is unsound; the text names the file and the entry.
-    """
-    from latticebench.systems.toml import read_toml
-
-    content = read_toml(path)
-    for key in content:
-        if key != "effect":
-            raise unknown("key", key, ["effect"], str(path))
-    entries = content.get("effect")
-    if not isinstance(entries, list) or not entries:
-        raise InputError(f"{path}: give at least one table [[effect]] with a name and a formula")
-    known = [one.name for one in fields(Effect)]
-    found = []
-    for number, entry in enumerate(entries, start=1):
-        where = f"{path}: effect {number}"
-        if not isinstance(entry, dict):
-            raise InputError(f"{where}: it is {entry!r}; it must be a table [[effect]]")
-        for key in entry:
-            if key not in known:
-                raise unknown("key", key, known, where)
-        for key in ("name", "formula"):
-            if not isinstance(entry.get(key), str):
-                raise InputError(f"{where}: the key {key!r} is missing or is no text")
-        orders = entry.get("orders", [1, 2])
-        if (
-            not isinstance(orders, list)
-            or not orders
-            or any(type(one) is not int or one not in (1, 2) for one in orders)
-        ):
-            raise InputError(f"{where}: orders is {orders!r}; it must be a list of 1 and 2")
-        for key, value in entry.items():
-            wanted = bool if key in ("real", "takes") else list if key == "orders" else str
-            if not isinstance(value, wanted):
-                raise InputError(f"{where}: {key} is {value!r}; it must be a {wanted.__name__}")
-        try:
-            found.append(Effect(**{**entry, "orders": tuple(orders)}))
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
-    names = [effect.name for effect in (*CATALOGUE, *found)]
-    for effect in found:
-        if names.count(effect.name) > 1:
-            raise InputError(f"{path}: there are two effects called {effect.name!r}")
-    return tuple(found)
 
 
 NAYFEH = "Nayfeh & Mook, Nonlinear Oscillations (1979)"
@@ -244,7 +188,8 @@ CATALOGUE: tuple[Effect, ...] = (
     ),
     Effect(
         "asymmetric-coupling", "(u[n+1]-u[n-1])/2",
-        look_for="waves to the right and to the left that differ", source="Hatano & Nelson, Phys. Rev. Lett. 77, 570 (1996)",
+        look_for="waves to the right and to the left that differ",
+        source="Hatano & Nelson, Phys. Rev. Lett. 77, 570 (1996)",
     ),
     Effect(
         "intersite-nonlinearity", "", complex_field="abs(u[n])**2*(u[n+1]+u[n-1])",
@@ -261,7 +206,8 @@ CATALOGUE: tuple[Effect, ...] = (
     ),
     Effect(
         "gain-loss", "", complex_field="u[n]", acts="alternating", real=True,
-        look_for="neighbours of which one grows and one fades", source="Konotop et al., Rev. Mod. Phys. 88, 035002 (2016)",
+        look_for="neighbours of which one grows and one fades",
+        source="Konotop et al., Rev. Mod. Phys. 88, 035002 (2016)",
     ),
     # Places.
     Effect("defect", "u[n]", acts="one site", look_for="a residual at one site and its neighbours", source=BRAUN),
@@ -269,7 +215,10 @@ CATALOGUE: tuple[Effect, ...] = (
         "unequal-masses", "u[n]", acts="one equation",
         look_for="one site that answers all forces too much or too little", source=BRAUN,
     ),
-    Effect("ends", "u[n]", acts="ends", look_for="a residual that starts at the ends and travels inward", source="this project"),
+    Effect(
+        "ends", "u[n]", acts="ends",
+        look_for="a residual that starts at the ends and travels inward", source="this project",
+    ),
     Effect(
         "disorder", "u[n]", acts="every site",
         look_for="a residual of each site's own", source="Anderson, Phys. Rev. 109, 1492 (1958)",
@@ -277,8 +226,14 @@ CATALOGUE: tuple[Effect, ...] = (
     # The instrument.
     Effect("sensor-offset", "1", acts="offset", look_for="a residual that does not change in time", source=LJUNG),
     Effect("sensor-gain", "u[n]", acts="gain", look_for="a residual in proportion to one site's reading", source=LJUNG),
-    Effect("sensor-curve", "u[n]**2", complex_field="abs(u[n])*u[n]", acts="curve", look_for="a residual in proportion to the square of the reading", source=LJUNG),
-    Effect("clock", "v[n]", acts="clock", look_for="a residual in proportion to the velocity, at all sites at once", source=LJUNG),
+    Effect(
+        "sensor-curve", "u[n]**2", complex_field="abs(u[n])*u[n]", acts="curve",
+        look_for="a residual in proportion to the square of the reading", source=LJUNG,
+    ),
+    Effect(
+        "clock", "v[n]", acts="clock",
+        look_for="a residual in proportion to the velocity, at all sites at once", source=LJUNG,
+    ),
     Effect(
         "quantisation", "u[n]", acts="rounding",
         look_for="readings that are multiples of a step", source="Widrow & Kollar, Quantization Noise (2008)",

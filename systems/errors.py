@@ -1,4 +1,4 @@
-"""The one error that a user can cause."""
+"""The error that is raised for everything a user can give wrongly."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """Something a user gave is wrong; the text says what, where, and what to do.
+    """Raised for wrong input; the message says what is wrong, where, and what to do.
 
-    The command line prints the text as one line and exits with code 2.
+    The command line prints the message as one line and exits with code 2.
     """
 
 
 def unknown(kind: str, given: str, known: Iterable[str], where: str = "") -> InputError:
-    """Build the error for a name that is not among the known ones, with the nearest as a suggestion."""
+    """Return the error for a name that is not among the known ones, with the closest one as a suggestion."""
     names = sorted(known)
     near = difflib.get_close_matches(given, names, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
     prefix = f"{where}: " if where else ""
-    return InputError(f"{prefix}unknown {kind} {given!r}; {hint}there are: {', '.join(names) or 'none'}")
+    return InputError(f"{prefix}unknown {kind} {given!r}; {hint}known: {', '.join(names) or 'none'}")

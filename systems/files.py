@@ -14,12 +14,12 @@ from latticebench.systems.errors import InputError
 
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path`, and rename it to `path` when the block ends without an error.
+    """Yield a temporary path beside `path`, and rename it to `path` when the block ends without an error.
 
-    The name keeps the ending, since writers choose the format by it.
+    Missing folders are made. The temporary name keeps the ending, by which writers choose the format.
 
     Raises:
-        InputError: the folder is missing, not writable, or the disk is full; `path` is left as it was.
+        InputError: the folder cannot be made or written to, or the disk is full; `path` is left as it was.
     """
     temporary = None
     try:
@@ -30,7 +30,7 @@ def whole(path: Path) -> Iterator[Path]:
         yield temporary
         with temporary.open("rb") as written:
             os.fsync(written.fileno())
-        # mkstemp makes files for the owner alone; a result is for everyone whom the umask lets read.
+        # mkstemp makes files that only their owner may read; the umask decides who may read a result.
         mask = os.umask(0)
         os.umask(mask)
         temporary.chmod(0o666 & ~mask)
@@ -46,7 +46,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all, UTF-8.
+    """Write a text file in UTF-8, whole or not at all.
 
     Raises:
         InputError: it cannot be written.

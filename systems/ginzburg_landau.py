@@ -1,11 +1,16 @@
 """The discrete complex Ginzburg-Landau lattice (DCGL).
 
-    u_n' = (1 + i) C (u_{n+1} + u_{n-1} - 2 u_n) - (1 - i) |u_n|^2 u_n + u_n
+    u_n' = (1 + i) C (u_{n+1} + u_{n-1} - 2 u_n) - (1 - i) |u_n|^2 u_n + u_n,   n = 1..N
 
-Complex field, first order, dimensionless; C = 1/h^2. It turns with the phase of u; nothing is conserved: the linear term
-pumps, the coupling and the cubic term damp. The initial state is a Nozaki-Bekki hole.
+Complex field, first order, dimensionless. Site n is entry n - 1 of an array. The ends are free: u_0 = u_1 and
+u_{N+1} = u_N. C = 1/h^2 with the lattice spacing h; initial states are functions of x_n, N points evenly spaced on
+[-N h/2, N h/2], both ends included.
 
-Source: the paper, equation (4) and Table 1; the libraries are those of the DNLS lattice, every coefficient complex.
+The equation does not change when u is multiplied by a phase, exp(i a). Nothing is conserved: the linear term pumps, the
+coupling and the cubic term damp. The initial state is a Nozaki-Bekki hole.
+
+Source: the paper (see `latticebench.systems`), equation (4) and Table 1; the libraries are those of the DNLS lattice,
+every coefficient complex.
 """
 
 from latticebench.systems.dnls import LIBRARIES

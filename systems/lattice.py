@@ -1,44 +1,28 @@
-"""Lattices: libraries of terms, systems, their ends, and the right-hand side that follows from an equation.
+"""Lattices: libraries of terms, and systems with their equation, ends, initial states and source.
 
-Index convention: arrays are (times, sites); site k = 0..N-1 of an array is the paper's n = k + 1.
-Everything is dimensionless unless a system says otherwise.
+Positions are x_n; site k = 0..N-1 of an array is the paper's n = k + 1. Everything is dimensionless unless a system
+says otherwise.
 """
 
 from __future__ import annotations
 
 import ast
-import functools
-import importlib.util
 import math
-import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.terms import (
-    FUNCTIONS,
-    Slot,
-    Term,
-    TermError,
-    check,
-    compiled,
-    express,
-    partials,
-    real_parts,
-    substitute,
-    symbolic,
-)
+from latticebench.systems.parser import FUNCTIONS, TermError, parse
+from latticebench.systems.stencil import Ends, reach_of
+from latticebench.systems.terms import Term, express, substitute, symbolic
 
 if TYPE_CHECKING:
-    import scipy.sparse
-    from jaxtyping import Float, Int
+    from jaxtyping import Float
     from numpy import ndarray
 
-Ends = Literal["unknown", "free", "fixed", "periodic", "antiperiodic"]
 Integrator = Literal["rk4", "bdf", "dop853"]
 
 
@@ -46,8 +30,13 @@ Integrator = Literal["rk4", "bdf", "dop853"]
 class Library:
     """An ordered set of candidate terms.
 
+    Attributes:
+        name: what it is called.
+        terms: the candidates, in order.
+        source: where it comes from.
+
     Raises:
-        InputError: it is empty or names a term twice.
+        InputError: it is empty or has a term twice.
     """
 
     name: str
@@ -65,27 +54,30 @@ class Library:
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """The terms as they were given."""
+        """The texts of the terms, as they were given."""
         return tuple(term.text for term in self.terms)
 
     @property
     def reach(self) -> tuple[int, int]:
-        """How many sites the widest terms see to the left and to the right."""
-        return max(term.reach[0] for term in self.terms), max(term.reach[1] for term in self.terms)
+        """The number of sites that the widest terms read to the left and to the right."""
+        return reach_of(self.terms)
 
     def uses(self, name: str) -> bool:
-        """Whether any term holds `name`: u, v, f, t, n, i or a function."""
+        """Return whether any term contains `name`: u, v, f, t, n, i or a function."""
         return any(name in term.names for term in self.terms)
 
 
 def library(name: str, terms: str | Sequence[str], source: str = "", *, with_imaginary: bool = False) -> Library:
-    """Make a library from texts.
+    """Return a library made from texts.
 
     Args:
         name: what it is called.
-        terms: a list of terms, or one text with `;` between them.
+        terms: a list of terms, or one text in which they are separated by `;`.
         source: where it comes from.
-        with_imaginary: give every term T a companion i*T, so that each complex coefficient is two real ones.
+        with_imaginary: add i*T after every term T, so that each complex coefficient is two real ones.
+
+    Raises:
+        InputError: a text is not in the term language, or the library is empty or has a term twice.
     """
     texts = [text.strip() for text in (terms.split(";") if isinstance(terms, str) else terms)]
     texts = [text for text in texts if text]
@@ -95,15 +87,18 @@ def library(name: str, terms: str | Sequence[str], source: str = "", *, with_ima
 
 
 def _is_product(text: str) -> bool:
-    tree = check(text)
+    """Return whether a factor can be written in front of a text without brackets."""
+    tree = parse(text)
     return not (isinstance(tree, ast.BinOp) and isinstance(tree.op, (ast.Add, ast.Sub, ast.Div)))
 
 
 @dataclass(frozen=True)
 class Initial:
-    """An initial state as texts in the position x, the site number n and the system's parameters.
+    """An initial state, as texts in the position x, the site number n and the parameters of the system.
 
-    `v` is the initial velocity of a second-order system.
+    Attributes:
+        u: the field.
+        v: its velocity, which only a second-order system has.
     """
 
     u: str
@@ -114,12 +109,27 @@ class Initial:
 class System:
     """An equation of motion with its ends, initial states, libraries and source.
 
-    The equation is d^order u_n / dt^order = `equation`, a text of the term language in which the names of `parameters`
-    stand for numbers. Positions are x_n, N points taken uniformly from [-L, L] with L = `half_length`, a text in N and the
-    parameters.
+    The equation is d^order u_n / dt^order = `equation`. The N positions x_n are evenly spaced on [-L, L], both ends
+    included, with L = `half_length`.
+
+    Attributes:
+        name: what it is called in suites, on the command line and in tables.
+        title: its full name.
+        equation: the right-hand side in the term language, in which the names of `parameters` stand for numbers.
+        order: of the time derivative.
+        is_complex: whether the field is complex.
+        parameters: names with their default values.
+        initials: initial states by name; the first is the default.
+        libraries: candidate terms to find the equation with.
+        source: where the equation comes from.
+        half_length: L, a text in N and the parameters.
+        sites: the default N.
+        ends: how the chain ends.
+        integrator: how it is simulated unless asked otherwise.
+        notes: what else a user should know.
 
     Raises:
-        InputError: any text is outside the language, or a field is unsound.
+        InputError: a text is outside the language, or a field is invalid.
     """
 
     name: str
@@ -169,12 +179,12 @@ class System:
                 raise InputError(f"{where}: it has two libraries called {one!r}")
 
     def _check(self, key: str, text: str, names: tuple[str, ...], without: tuple[str, ...] | None = None) -> None:
-        """Check one text; with `without`, it is computed before there is a field, and these names have no value."""
+        """Check one text; `without` is given for a text without fields, and lists further names without a value."""
         where = f"system {self.name!r}: {key}"
         if not isinstance(text, str):
             raise InputError(f"{where} is {text!r}; it must be a text")
         try:
-            tree = check(text, names)
+            tree = parse(text, names)
         except TermError as error:
             raise InputError(f"{where}: {error}") from None
         for node in ast.walk(tree) if without is not None else ():
@@ -182,10 +192,10 @@ class System:
                 raise InputError(f"{where}: {text!r} holds {ast.unparse(node)}, which has no value there")
 
     def with_parameters(self, given: Mapping[str, float]) -> dict[str, float]:
-        """Fill the defaults up with the given values.
+        """Return the default parameters, updated with the given values.
 
         Raises:
-            InputError: a name that the system does not have, or a value that is not finite.
+            InputError: the system has no parameter of a name, or a value is not a finite number.
         """
         for name, value in given.items():
             if name not in self.parameters:
@@ -195,10 +205,10 @@ class System:
         return {**self.parameters, **{name: float(value) for name, value in given.items()}}
 
     def library(self, name: str) -> Library:
-        """Look one of the system's libraries up.
+        """Return the library of this name.
 
         Raises:
-            InputError: there is none of that name.
+            InputError: there is none of this name.
         """
         for one in self.libraries:
             if one.name == name:
@@ -206,11 +216,11 @@ class System:
         raise unknown("library", name, [one.name for one in self.libraries], f"system {self.name!r}")
 
     def motion(self, parameters: Mapping[str, float]) -> Term:
-        """Give the right-hand side with numbers in the place of the parameters."""
+        """Return the right-hand side with numbers in place of the parameters."""
         return Term(substitute(self.equation, self.with_parameters(parameters)))
 
     def truth(self, candidates: Library, parameters: Mapping[str, float]) -> Float[ndarray, " terms"] | None:
-        """Derive the true coefficients over a library; None where the equation is outside its span."""
+        """Return the true coefficients over a library, or None if the equation is outside its span."""
         return express(self.motion(parameters), candidates.terms, self.is_complex)
 
     def initial_state(
@@ -220,27 +230,27 @@ class System:
         kind: str | None = None,
         variation: np.random.Generator | None = None,
     ) -> tuple[ndarray, ndarray | None]:
-        """Compute an initial state.
+        """Return an initial state.
 
         Args:
             parameters: values that differ from the defaults.
             sites: N.
-            kind: the name of one of `initials`; the first when None.
-            variation: draws another state near by: the profile moved by up to two sites and three slow waves of a tenth
-                of the field's size added to it (and to its velocity); None for the state as it is written.
+            kind: the name of one of `initials`; the first if None.
+            variation: draws a state close to the written one: the profile is moved by up to two sites, and three slow
+                waves of a tenth of the size of the field are added to it and to its velocity; none is drawn if None.
 
         Returns:
-            u (N,) and v (N,) or None for a first-order system; complex for a complex system.
+            u (N,), and v (N,) or None for a first-order system; complex for a complex system.
 
         Raises:
-            InputError: there is no such initial state, or it is not finite for these parameters.
+            InputError: there is no such initial state, or it is not finite or not real for these parameters.
         """
         kind = kind if kind is not None else next(iter(self.initials))
         if kind not in self.initials:
             raise unknown("initial state", kind, self.initials, f"system {self.name!r}")
         values = self.with_parameters(parameters)
         n = np.arange(sites) - (sites - 1) / 2
-        # A length that is endless, negative or not real comes out as nan and is told below.
+        # A length that is infinite, negative or not real becomes nan, which is reported below.
         with np.errstate(all="ignore"):
             length = _positive(_numeric(self.half_length, {**values, "N": float(sites)}))
             x = 2 * length * n / max(sites - 1, 1)
@@ -270,365 +280,28 @@ class System:
 
 
 def _numeric(text: str, values: Mapping[str, Any]) -> Any:
-    """Evaluate a checked text with numbers or arrays for its names."""
+    """Return the value of a checked text for numbers or arrays in place of its names."""
     import sympy
 
     names = tuple(sorted(name for name in values if name != "n"))
     expression = symbolic(text, names)
     symbols = [sympy.Symbol(name, real=True) for name in values]
     function = sympy.lambdify(symbols, expression, modules="numpy")
-    # Real arithmetic first: far out a complex 1/cosh(x)**2 is nan, the real one 0. Complex is for roots of negative numbers.
+    # Far out a complex 1/cosh(x)**2 is nan and the real one 0; roots of negative numbers are complex only.
     found, wide = (function(*(np.asarray(value, dtype=kind) for value in values.values())) for kind in (float, complex))
     return wide if not np.all(np.isfinite(found)) and np.all(np.isfinite(wide)) else found
 
 
 def _positive(value: Any) -> float:
-    """Take a computed length as a number; nan when it is not a positive one."""
+    """Return a computed length as a number, nan if it is not positive and finite."""
     number = complex(value)
     return number.real if number.imag == 0 and 0 < number.real < math.inf else math.nan
 
 
 def _slow_waves(n: ndarray, sites: int, is_complex: bool, draw: np.random.Generator) -> ndarray:
-    """Three waves along the chain, each a tenth of one in size, with random phases."""
+    """Return the sum of three waves along the chain, each of an amplitude of about 0.1 and a random phase."""
     waves = np.zeros(sites, dtype=complex)
     for wave_number in (1, 2, 3):
         amplitude = 0.1 * draw.normal() + (0.1j * draw.normal() if is_complex else 0)
         waves += amplitude * np.cos(np.pi * wave_number * n / sites + draw.uniform(0, 2 * np.pi))
     return waves
-
-
-# Ends ---------------------------------------------------------------------------------------------------------------------
-
-
-@functools.lru_cache(maxsize=256)
-def ghosts(sites: int, left: int, right: int, ends: Ends) -> tuple[Int[ndarray, " padded"], Float[ndarray, " padded"]]:
-    """Say what the sites beyond the ends repeat: padded[j] = factor[j] * u[index[j]].
-
-    free: mirrored about the last bond, u_0 = u_1 and u_{-1} = u_2 (paper, section 2.1); fixed: walls, zero outside;
-    periodic: u_{n+N} = u_n; antiperiodic: u_{n+N} = -u_n; unknown: no ghosts, so that only sites whose whole stencil was
-    observed count.
-
-    Raises:
-        InputError: the chain is shorter than the stencil.
-    """
-    if ends == "unknown":
-        if sites <= left + right:
-            raise InputError(
-                f"the library's stencil needs {left + right + 1} sites, the data have {sites}; "
-                "use terms with fewer neighbours, or say how the chain ends (free, fixed, periodic, antiperiodic)"
-            )
-        return np.arange(sites), np.ones(sites)
-    if sites < max(left, right) and ends != "fixed":
-        raise InputError(f"the library's stencil reaches {max(left, right)} sites, the chain has {sites}")
-    place = np.arange(-left, sites + right)
-    inside = (place >= 0) & (place < sites)
-    if ends == "free":
-        index = np.where(place < 0, -1 - place, np.where(place >= sites, 2 * sites - 1 - place, place))
-        return index, np.ones(len(place))
-    if ends == "fixed":
-        return np.clip(place, 0, sites - 1), inside.astype(float)
-    sign = np.where(inside, 1.0, -1.0) if ends == "antiperiodic" else np.ones(len(place))
-    return place % sites, sign
-
-
-def observed(sites: int, reach: tuple[int, int], ends: Ends) -> slice:
-    """Give the sites at which a library of this reach can be evaluated."""
-    return slice(reach[0], sites - reach[1]) if ends == "unknown" else slice(0, sites)
-
-
-def evaluate(
-    terms: Sequence[Term],
-    u: ndarray,
-    v: ndarray | None,
-    f: ndarray | None,
-    t: Float[ndarray, " time"],
-    *,
-    ends: Ends,
-    reach: tuple[int, int] | None = None,
-) -> Float[ndarray, "parts terms time sites"]:
-    """Evaluate terms along a trajectory.
-
-    Args:
-        terms: what to evaluate.
-        u: the field, (time, N), real or complex.
-        v: its velocity, or None.
-        f: the measured input, (time, N), or None.
-        t: times.
-        ends: how the chain ends; with "unknown" only sites whose whole stencil lies inside are evaluated.
-        reach: the stencil that decides which those are; that of `terms` when None.
-
-    Returns:
-        the terms' real parts, and for a complex field their imaginary parts. NaN where the data are NaN.
-
-    Raises:
-        InputError: a term needs v or f and there is none, or the chain is too short.
-    """
-    needed = {name for term in terms for name in term.names}
-    for name, array, what in (("v", v, "velocities v1..vN"), ("f", f, "measured inputs f1..fN")):
-        if name in needed and array is None:
-            raise InputError(f"the library uses {name}[n], but the data have no {what}")
-    if reach is None:
-        reach = max(term.reach[0] for term in terms), max(term.reach[1] for term in terms)
-    is_complex = np.iscomplexobj(u)
-    sites = u.shape[1]
-    index, factor = ghosts(sites, *reach, ends)
-    start = reach[0]
-    count = len(index) - sum(reach)
-    fields: dict[tuple[str, str], ndarray] = {}
-    for name, array in (("u", u), ("v", v), ("f", f)):
-        if array is not None:
-            # A wall holds zero even where the value that stands in for it is missing.
-            padded = np.where(factor == 0, 0.0, array[:, index] * factor)
-            fields[name, "re"], fields[name, "im"] = padded.real, padded.imag
-    n = (np.arange(sites) - (sites - 1) / 2)[observed(sites, reach, ends)]
-    bundle = compiled(tuple(term.text for term in terms), is_complex)
-    arrays: list[Any] = []
-    for slot in bundle.slots:
-        if slot.name == "t":
-            arrays.append(np.broadcast_to(t[:, None], (len(t), count)))
-        elif slot.name == "n":
-            arrays.append(np.broadcast_to(n, (len(t), count)))
-        else:
-            arrays.append(fields[slot.name, slot.part][:, start + slot.offset : start + slot.offset + count])
-    # Where a term is not finite (log of 0, an overflow) its value says so; no warning is needed beside it.
-    with np.errstate(all="ignore"):
-        values = bundle.function(*arrays)
-    shape = (len(t), count)
-    stacked = np.stack([np.broadcast_to(value, shape) for value in values])
-    return stacked.reshape(1 + is_complex, len(terms), *shape).astype(float)
-
-
-# The right-hand side on a chain -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Motion:
-    """An equation on a chain of N sites, as a first-order system in real variables.
-
-    The state y is [u] or [Re u, Im u], for order 2 followed by the velocity likewise: length order * parts * N.
-    """
-
-    term: Term
-    order: int
-    is_complex: bool
-    sites: int
-    ends: Ends
-
-    @property
-    def parts(self) -> int:
-        """1 for a real field, 2 for a complex one."""
-        return 1 + self.is_complex
-
-    def pack(self, u: ndarray, v: ndarray | None) -> Float[ndarray, " state"]:
-        """Write u (N,) and v (N,) as a state; for first-order equations v is left out."""
-        fields = [u] if self.order == 1 else [u, np.zeros_like(u) if v is None else v]
-        pieces = [part for one in fields for part in ((one.real, one.imag) if self.is_complex else (one,))]
-        return np.concatenate(pieces).astype(float)
-
-    def unpack(self, y: Float[ndarray, "state *times"]) -> tuple[ndarray, ndarray | None]:
-        """Read u and v (None for order 1) from states, one a column: each (times, N)."""
-        blocks = np.asarray(y).T.reshape(*np.shape(y)[1:], self.order, self.parts, self.sites)
-        fields = blocks[..., 0, :] + 1j * blocks[..., 1, :] if self.is_complex else blocks[..., 0, :]
-        return fields[..., 0, :], (fields[..., 1, :] if self.order == 2 else None)
-
-    @functools.cached_property
-    def right_hand_side(self) -> Callable[[float, ndarray], ndarray]:
-        """The function dy/dt = F(t, y)."""
-        bundle = compiled((self.term.text,), self.is_complex)
-        gather = self._gather(bundle.slots)
-        size = self.parts * self.sites
-
-        def derivative(t: float, y: ndarray) -> ndarray:
-            values = bundle.function(*gather(t, y))
-            rate = np.empty_like(y)
-            if self.order == 2:
-                rate[:size] = y[size:]
-            for part, value in enumerate(values):
-                first = (self.order - 1) * size + part * self.sites
-                rate[first : first + self.sites] = value
-            return rate
-
-        return derivative
-
-    @functools.cached_property
-    def jacobian(self) -> Callable[[float, ndarray], scipy.sparse.csc_array]:
-        """The function dF/dy (t, y), sparse: (state, state)."""
-        import scipy.sparse
-
-        bundle, places = partials((self.term.text,), self.is_complex)
-        gather = self._gather(bundle.slots)
-        size, sites = self.parts * self.sites, self.sites
-        left, right = self.term.reach
-        index, factor = ghosts(sites, left, right, self.ends)
-        rows, columns, weights = [], [], []
-        for _, part, slot in places:
-            window = slice(left + slot.offset, left + slot.offset + sites)
-            block = (size if slot.name == "v" else 0) + (sites if slot.part == "im" else 0)
-            rows.append((self.order - 1) * size + part * sites + np.arange(sites))
-            columns.append(block + index[window])
-            weights.append(factor[window])
-        shape = (self.order * size, self.order * size)
-        identity = (
-            scipy.sparse.csc_array((np.ones(size), (np.arange(size), size + np.arange(size))), shape=shape)
-            if self.order == 2
-            else scipy.sparse.csc_array(shape)
-        )
-
-        def derivative(t: float, y: ndarray) -> scipy.sparse.csc_array:
-            if not places:
-                return identity
-            values = bundle.function(*gather(t, y))
-            data = np.concatenate([np.broadcast_to(value, sites) * w for value, w in zip(values, weights, strict=True)])
-            place = (np.concatenate(rows), np.concatenate(columns))
-            return scipy.sparse.csc_array(identity + scipy.sparse.csc_array((data, place), shape=shape))
-
-        return derivative
-
-    def _gather(self, slots: tuple[Slot, ...]) -> Callable[[float, ndarray], list[Any]]:
-        """Make the function that cuts a state into the windows a compiled term takes."""
-        left, right = self.term.reach
-        index, factor = ghosts(self.sites, left, right, self.ends)
-        n = np.arange(self.sites) - (self.sites - 1) / 2
-        sites, parts = self.sites, self.parts
-        for slot in slots:
-            if slot.name == "f":
-                raise InputError(
-                    "an equation with a measured input f[n] cannot be simulated; write the force as a function of t"
-                )
-
-        def windows(t: float, y: ndarray) -> list[Any]:
-            padded = y.reshape(self.order, parts, sites)[:, :, index] * factor
-            arrays: list[Any] = []
-            for slot in slots:
-                if slot.name == "t":
-                    arrays.append(t)
-                elif slot.name == "n":
-                    arrays.append(n)
-                else:
-                    first = left + slot.offset
-                    arrays.append(padded[int(slot.name == "v"), int(slot.part == "im"), first : first + sites])
-            return arrays
-
-        return windows
-
-
-def motion(system: System, parameters: Mapping[str, float], sites: int, ends: Ends | None = None) -> Motion:
-    """Put a system on a chain of `sites` sites, with its own ends when `ends` is None.
-
-    Raises:
-        InputError: the equation is complex on a real field or needs a velocity that a first-order lattice lacks.
-    """
-    term = system.motion(parameters)
-    real_parts(term.text, system.is_complex)
-    if system.order == 1 and "v" in term.names:
-        raise InputError(f"system {system.name!r}: a first-order equation has no velocity v[n]")
-    return Motion(term, system.order, system.is_complex, sites, ends or system.ends)
-
-
-# A user's own system ------------------------------------------------------------------------------------------------------
-
-
-def load(path: Path) -> System:
-    """Load a user's system from a Python file that defines `SYSTEM`, or from a TOML file.
-
-    A TOML file has the fields of `System` as keys; `initials` is a table of tables with `u` and `v`, `libraries` a table of
-    lists of terms.
-
-    Raises:
-        InputError: the file is missing or does not hold a sound system.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    if path.suffix == ".py":
-        found = getattr(load_module(path), "SYSTEM", None)
-        if not isinstance(found, System):
-            raise InputError(f"{path}: it must define SYSTEM = System(...)")
-        return found
-    return _from_toml(path)
-
-
-def load_module(path: Path) -> Any:
-    """Import a user's Python file under a name of its own.
-
-    Raises:
-        InputError: the file is missing or fails when imported.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    spec = importlib.util.spec_from_file_location(f"latticebench_user_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their module up by its name.
-    sys.modules[spec.name] = module
-    try:
-        # A user's folder is not ours to write into.
-        before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
-        try:
-            spec.loader.exec_module(module)
-        finally:
-            sys.dont_write_bytecode = before
-    except (Exception, SystemExit) as error:
-        del sys.modules[spec.name]
-        if isinstance(error, InputError):
-            raise InputError(f"{path}: {error}") from error
-        raise InputError(f"{path}: it cannot be imported: {type(error).__name__}: {error}") from error
-    return module
-
-
-def _from_toml(path: Path) -> System:
-    from latticebench.systems.toml import read_toml
-
-    content = read_toml(path)
-    fields = (
-        "name",
-        "title",
-        "equation",
-        "order",
-        "complex",
-        "parameters",
-        "initials",
-        "libraries",
-        "source",
-    )
-    optional = ("half_length", "sites", "ends", "integrator", "notes")
-    for key in content:
-        if key not in (*fields, *optional):
-            raise unknown("key", key, (*fields, *optional), str(path))
-    for key in ("name", "equation", "order", "initials"):
-        if key not in content:
-            raise InputError(f"{path}: the key {key!r} is missing")
-    is_complex = content.get("complex", False)
-    if not isinstance(is_complex, bool):
-        raise InputError(f"{path}: complex is {is_complex!r}; it must be true or false")
-    for key in ("parameters", "initials", "libraries"):
-        if not isinstance(content.get(key, {}), dict):
-            raise InputError(f"{path}: {key} is {content[key]!r}; it must be a table, as under [{key}]")
-    for kind, texts in content["initials"].items():
-        if not isinstance(texts, dict) or "u" not in texts or not set(texts) <= {"u", "v"}:
-            raise InputError(f"{path}: initials.{kind} is {texts!r}; it must be a table of u and, for order 2, v")
-    try:
-        return System(
-            name=content["name"],
-            title=content.get("title", content["name"]),
-            equation=content["equation"],
-            order=content["order"],
-            is_complex=is_complex,
-            parameters=content.get("parameters", {}),
-            initials={name: Initial(**texts) for name, texts in content["initials"].items()},
-            libraries=tuple(_library_of(name, terms) for name, terms in content.get("libraries", {}).items()),
-            source=content.get("source", str(path)),
-            **{key: content[key] for key in optional if key in content},
-        )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def _library_of(name: str, terms: Any) -> Library:
-    """Make a library of what a file has under libraries.NAME."""
-    if not isinstance(terms, str) and not (isinstance(terms, list) and all(isinstance(one, str) for one in terms)):
-        raise InputError(f"libraries.{name} is {terms!r}; it must be a list of terms, or one text with ; between them")
-    try:
-        return library(name, terms)
-    except TermError as error:
-        raise InputError(f"libraries.{name}: {error}") from None

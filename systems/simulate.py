@@ -1,4 +1,4 @@
-"""Making samples of a system: integrators, sampling, noise."""
+"""Samples of a system: integrators, sample times, noise and gaps."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Ends, Integrator, Motion, System, motion
+from latticebench.systems.lattice import Integrator, System
+from latticebench.systems.motion import Motion, motion
 from latticebench.systems.samples import Samples, SimulatedSamples
+from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -25,12 +27,15 @@ MAX_VALUES = 50_000_000
 def sample_times(
     count: int = 50, span: float = 10.0, uneven: np.random.Generator | None = None
 ) -> Float[ndarray, " time"]:
-    """Give `count` times in [0, span): the paper's 0, 0.2, ..., 9.8 by default.
+    """Return `count` times in [0, span): by default the paper's 0, 0.2, ..., 9.8.
 
-    With a generator in `uneven`, all but the first are drawn uniformly and sorted.
+    Args:
+        count: how many.
+        span: the end of the interval, itself left out.
+        uneven: draws all times but the first uniformly; evenly spaced if None.
 
     Raises:
-        InputError: fewer than two times or no span.
+        InputError: fewer than two times, or a span that is not positive and finite.
     """
     if count < 2:
         raise InputError(f"samples: {count} is too few; at least 2 are needed")
@@ -47,14 +52,15 @@ def integrate(
     times: Float[ndarray, " time"],
     method: Integrator = "dop853",
 ) -> Float[ndarray, "state time"]:
-    """Integrate a chain from `start` at times[0] through all `times`.
+    """Return the states of a chain at `times`, integrated from `start` at times[0].
 
-    `rk4`: the paper's, classical Runge-Kutta of order 4 with steps of 1e-3 (shorter where a sample time asks for it).
-    `bdf`: the paper's implicit backward differences, of variable order and step (SciPy), tolerances 1e-9 and 1e-11, with the
-    exact Jacobian. `dop853`: Runge-Kutta of order 8 with tolerances 1e-13 (SciPy), the reference.
+    `rk4`: the paper's classical Runge-Kutta method of order 4 with steps of about 1e-3 (see `runge_kutta`).
+    `bdf`: the paper's implicit backward differentiation formulas of variable order and step (SciPy's BDF) with relative
+    and absolute tolerances 1e-9 and 1e-11 and the exact Jacobian.
+    `dop853`: the reference, a Runge-Kutta method of order 8 with tolerances 1e-13 (SciPy's DOP853).
 
     Raises:
-        InputError: the state grows without bound or the integrator gives up.
+        InputError: the state grows without bound, or the integrator gives up.
     """
     if method == "rk4":
         return runge_kutta(chain.right_hand_side, start, times, PAPER_STEP)
@@ -63,7 +69,6 @@ def integrate(
         if method == "bdf"
         else {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
     )
-
     states, reached = _adaptive(chain, start, times, options)
     if reached != len(times):
         raise _unbounded(float(times[reached - 1]))
@@ -77,29 +82,30 @@ def follow(
     tolerance: float,
     most_evaluations: int,
 ) -> tuple[Float[ndarray, "state time"], int]:
-    """Integrate a chain that may break off, as far as it goes.
+    """Return the states of a chain as far as it can be integrated.
 
     Args:
         chain: what moves.
         start: the state at times[0].
-        times: when to give the state.
+        times: when to return the state.
         tolerance: relative and absolute, of the Runge-Kutta method of order 8.
-        most_evaluations: of the right-hand side; a chain that needs more counts as broken off.
+        most_evaluations: of the right-hand side; a chain that needs more counts as broken off at the start.
 
     Returns:
-        the states at the first times, and how many of the times they are.
+        the states at the first of the times, and the number of these.
     """
     options = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
     return _adaptive(chain, start, times, options, most_evaluations)
 
 
 class _Exhausted(Exception):
-    """The right-hand side was evaluated too often."""
+    """Raised when the right-hand side has been evaluated too often."""
 
 
 def _adaptive(
     chain: Motion, start: ndarray, times: ndarray, options: dict[str, Any], most_evaluations: int | None = None
 ) -> tuple[ndarray, int]:
+    """Return the finite and bounded states that `solve_ivp` finds, at least the first, and their number."""
     from scipy.integrate import solve_ivp
 
     limit = 1e6 * (1 + float(np.max(np.abs(start))))
@@ -136,9 +142,9 @@ def runge_kutta(
     times: Float[ndarray, " time"],
     step: float,
 ) -> Float[ndarray, "state time"]:
-    """Integrate dy/dt = rate(t, y) by the classical Runge-Kutta method of order 4.
+    """Return the states of dy/dt = rate(t, y) at `times` by the classical Runge-Kutta method of order 4.
 
-    Steps are as near to `step` as lets them end on each of `times`.
+    Each interval between two times is divided evenly, into steps as close to `step` as possible.
 
     Raises:
         InputError: the state grows without bound.
@@ -164,7 +170,8 @@ def runge_kutta(
 
 def _unbounded(t: float) -> InputError:
     return InputError(
-        f"the simulation fails near t = {t:g}: the state grows without bound; check parameters and initial state, or whether the integrator's step is too large (--integrator dop853)"
+        f"the simulation fails near t = {t:g}: the state grows without bound; check parameters and initial state, "
+        "or whether the integrator's step is too large (--integrator dop853)"
     )
 
 
@@ -178,23 +185,21 @@ def simulate(
     initial: str | None = None,
     variation: np.random.Generator | None = None,
     integrator: Integrator | None = None,
-    velocities: bool = True,
 ) -> SimulatedSamples:
-    """Simulate one trajectory without noise.
+    """Return one trajectory without noise, with velocities for a second-order system.
 
     Args:
         system: what moves.
         parameters: values that differ from the system's defaults.
-        sites: N, the system's own number when None.
-        times: sample times, the paper's 50 when None.
-        ends: the system's own when None.
-        initial: which initial state, the system's first when None.
-        variation: draws an initial state near that one (see `System.initial_state`).
-        integrator: the system's own (the paper's) when None.
-        velocities: give v too, for second-order systems.
+        sites: N; the system's own number if None.
+        times: sample times; the paper's 50 if None.
+        ends: how the chain ends; as the system's if None.
+        initial: the name of an initial state; the system's first if None.
+        variation: draws an initial state close to that one (see `System.initial_state`).
+        integrator: the system's own (the paper's) if None.
 
     Raises:
-        InputError: a name or value is unsound, or the motion is unbounded.
+        InputError: a name or value is invalid, or the motion is unbounded.
     """
     parameters = parameters or {}
     sites = system.sites if sites is None else sites
@@ -215,25 +220,35 @@ def simulate(
     du, dv = chain.unpack(rates)
     listed = ", ".join(f"{name}={value:g}" for name, value in system.with_parameters(parameters).items())
     source = f"{system.name}({listed}), {sites} sites, {len(times)} samples"
-    exact = Samples(times, u, v if velocities else None, source=source)
+    exact = Samples(times, u, v, source=source)
     return SimulatedSamples(
         exact.t, exact.u, exact.v, source=source, sigma=0.0,
-        equation=chain.term.text, exact=replace(exact, v=v), rate=dv if system.order == 2 else du,
+        equation=chain.term.text, exact=exact, rate=dv if system.order == 2 else du,
     )  # fmt: skip
 
 
 def noise_size(field: ndarray, level: float) -> float:
-    """Turn a noise level into a standard deviation: level x RMS of the field about its mean."""
+    """Return the standard deviation of a noise level: level x RMS of the field about its mean."""
     return float(level * np.sqrt(np.mean(np.abs(field - np.mean(field)) ** 2)))
 
 
 def observe(
-    clean: SimulatedSamples, draw: np.random.Generator, *, noise: float = 0.0, missing: float = 0.0
+    clean: SimulatedSamples,
+    draw: np.random.Generator,
+    *,
+    noise: float = 0.0,
+    missing: float = 0.0,
+    velocities: bool = True,
 ) -> SimulatedSamples:
-    """Add what a measurement adds: Gaussian noise and gaps.
+    """Return what a measurement makes of a simulation: Gaussian noise is added and values are lost.
 
-    The noise on u (and on v, with a size of its own) has sigma = `noise` x RMS of the field about its mean; complex noise has
-    sigma^2 in total, half in each part. Each value is lost with the probability `missing`.
+    Args:
+        clean: the simulation.
+        draw: draws the noise and the gaps.
+        noise: sigma over the RMS of the field about its mean, for u and v alike; complex noise has the variance sigma^2
+            in total, half of it in each part.
+        missing: the probability that a value is lost.
+        velocities: whether v is observed, for a second-order system.
 
     Raises:
         InputError: a level is negative or not finite, or everything would be missing.
@@ -258,6 +273,6 @@ def observe(
         return np.asarray(noisy)
 
     return replace(
-        clean, u=disturbed(clean.u), v=None if clean.v is None else disturbed(clean.v),
+        clean, u=disturbed(clean.u), v=disturbed(clean.v) if velocities and clean.v is not None else None,
         sigma=noise_size(clean.u, noise), noise=noise,
     )  # fmt: skip

@@ -1,13 +1,17 @@
 """The discrete sine-Gordon lattice (Frenkel-Kontorova), a chain of coupled pendula.
 
-    u_n'' = C (u_{n+1} + u_{n-1} - 2 u_n) - sin(u_n)
+    u_n'' = C (u_{n+1} + u_{n-1} - 2 u_n) - sin(u_n),   n = 1..N
 
-Real field (angles), second order, dimensionless; C = 1/h^2. It does not change under u -> -u, u -> u + 2 pi, n -> -n and
-t -> -t. On free, fixed and periodic chains it conserves the energy
+Real field of angles in radians, second order, dimensionless. Site n is entry n - 1 of an array. The ends are free:
+u_0 = u_1 and u_{N+1} = u_N. C = 1/h^2 with the lattice spacing h; initial states are functions of x_n, N points evenly
+spaced on [-N h/2, N h/2], both ends included.
+
+The equation does not change under u -> -u, u -> u + 2 pi, n -> -n and t -> -t. On free, fixed, periodic and
+antiperiodic chains it conserves the energy
 
     E = sum_n [ v_n^2 / 2 + 1 - cos(u_n) ] + (C/2) sum over bonds (u_{n+1} - u_n)^2
 
-Source: the paper, equation (3) and Table 1; libraries (25)-(27).
+Source: the paper (see `latticebench.systems`), equation (3) and Table 1; libraries (25)-(27).
 """
 
 from latticebench.systems.lattice import Initial, System, library
@@ -18,7 +22,7 @@ SYSTEM = System(
     equation="C*(u[n+1]+u[n-1]-2*u[n]) - sin(u[n])",
     order=2,
     is_complex=False,
-    # The paper does not give the kink's speed.
+    # The paper does not state the speed v of the kink.
     parameters={"C": 0.5, "v": 0.5},
     initials={
         "kink": Initial(

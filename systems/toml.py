@@ -15,7 +15,7 @@ else:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file.
+    """Return the content of a TOML file.
 
     Raises:
         InputError: it is missing, is not text, or is not TOML.

@@ -71,9 +71,10 @@ def diagnose(
     from latticebench.bench.report.report import content, show, watching
     from latticebench.diagnosis.repair import diagnose as close_the_loop
     from latticebench.methods.method import make, solve
-    from latticebench.systems.effects import CATALOGUE, load
+    from latticebench.systems.effects import CATALOGUE
     from latticebench.systems.files import write_text
-    from latticebench.systems.samples import read_all
+    from latticebench.systems.readers import read_all
+    from latticebench.systems.user_files import load_effects
 
     if system is not None and (terms is not None or order is not None):
         raise InputError(
@@ -84,7 +85,7 @@ def diagnose(
             'give --system, or --terms and --order, such as --terms "u[n+1]+u[n-1]-2*u[n]; sin(u[n])" --order 2'
         )
     known, declared, order = declared_equation(system, terms, order)
-    catalogue = (*CATALOGUE, *(load(effects) if effects is not None else ()))
+    catalogue = (*CATALOGUE, *(load_effects(effects) if effects is not None else ()))
     ends = ends or ("unknown" if known is None else known.ends)
     data = read_all(files, ends)
     if known is not None and known.is_complex != data[0].is_complex:

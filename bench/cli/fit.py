@@ -50,7 +50,7 @@ def fit(
     from latticebench.bench.screen import show_fit, waiting
     from latticebench.methods.method import make, solve
     from latticebench.systems.files import write_text
-    from latticebench.systems.samples import read_all
+    from latticebench.systems.readers import read_all
 
     method = method or methods.DEFAULT
     chosen = make(methods.find(method), pairs(given))

@@ -83,7 +83,7 @@ def limit(
         for name, value in only_simulated.items():
             if value is not None:
                 raise InputError(f"{name}: files are given, whose samples are as they are; leave it out, or the files")
-        from latticebench.systems.samples import read_all
+        from latticebench.systems.readers import read_all
 
         data = read_all(files, ends or "unknown")
         with waiting(f"fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):

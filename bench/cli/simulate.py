@@ -38,7 +38,8 @@ def simulate(
     """Simulate a system and write samples of it."""
     from latticebench import systems
     from latticebench.bench.case import samples as make_samples
-    from latticebench.systems.samples import FORMATS, write
+    from latticebench.systems.readers import FORMATS
+    from latticebench.systems.writers import write
 
     found = systems.find(system)
     if out.suffix.lower() not in FORMATS:

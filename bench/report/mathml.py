@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from latticebench.bench.report.report import everywhere
 from latticebench.diagnosis.model import Change, Fitted
-from latticebench.systems.terms import Term, TermError
+from latticebench.systems.parser import TermError
+from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     import sympy

@@ -510,7 +510,7 @@ class _Traits:
 
 @cache
 def _traits(effect: Effect, order: int, is_complex: bool) -> _Traits:
-    from latticebench.systems.lattice import evaluate
+    from latticebench.systems.stencil import evaluate
 
     texts = effect.texts(order, is_complex) or (effect.formula or effect.complex_field or "1",)
     term = Term(texts[0])

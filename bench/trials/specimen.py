@@ -21,9 +21,11 @@ from latticebench.diagnosis.ways import ways
 from latticebench.methods.trajectory import Solution, State
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.lattice import Ends, Motion, System, motion
+from latticebench.systems.lattice import System
+from latticebench.systems.motion import Motion, motion
 from latticebench.systems.samples import Samples, SimulatedSamples
 from latticebench.systems.simulate import noise_size, sample_times
+from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -48,8 +48,9 @@ from latticebench.diagnosis.ways import ways
 from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import write_text
-from latticebench.systems.lattice import Ends, library
-from latticebench.systems.samples import read
+from latticebench.systems.lattice import library
+from latticebench.systems.readers import read
+from latticebench.systems.stencil import Ends
 from latticebench.systems.toml import read_toml
 
 if TYPE_CHECKING:

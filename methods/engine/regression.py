@@ -10,8 +10,9 @@ import numpy as np
 
 from latticebench.methods.engine.derivatives import differentiate
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Library, evaluate, observed
+from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
+from latticebench.systems.stencil import evaluate, observed
 
 if TYPE_CHECKING:
     from jaxtyping import Float

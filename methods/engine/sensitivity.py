@@ -28,9 +28,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latticebench.systems.compiler import Slot, compiled, partials
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Ends, ghosts, observed
-from latticebench.systems.terms import Slot, Term, compiled, partials
+from latticebench.systems.stencil import Ends, ghosts, observed
+from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     import scipy.sparse

@@ -13,7 +13,9 @@ import pytest
 from latticebench import systems
 from latticebench.bench import cli
 from latticebench.bench.trials.specimen import make
-from latticebench.systems.samples import Samples, read, write
+from latticebench.systems.readers import read
+from latticebench.systems.samples import Samples
+from latticebench.systems.writers import write
 
 SYSTEM = """
 name = "mine"

@@ -11,7 +11,7 @@ import pytest
 from latticebench.bench import cli, recordings
 from latticebench.bench.recordings import RECORDINGS, Recording, find, fingerprint, take
 from latticebench.systems.errors import InputError
-from latticebench.systems.samples import read
+from latticebench.systems.readers import read
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "measured"
 

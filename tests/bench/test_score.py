@@ -7,7 +7,7 @@ import pytest
 
 from latticebench import systems
 from latticebench.bench.score import forecast, score
-from latticebench.systems.lattice import motion
+from latticebench.systems.motion import motion
 from latticebench.systems.simulate import sample_times, simulate
 
 ONES = np.ones(4)

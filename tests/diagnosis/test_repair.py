@@ -21,7 +21,8 @@ from latticebench.diagnosis.trace import screen
 from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
-from latticebench.systems.samples import Samples, read_all
+from latticebench.systems.readers import read_all
+from latticebench.systems.samples import Samples
 from latticebench.systems.simulate import simulate
 
 GLIDERS = Path(__file__).parents[4] / "shared" / "data" / "measured" / "gliders.csv"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.systems.effects import CATALOGUE, Effect, find, load
+from latticebench.systems.effects import CATALOGUE, Effect, find
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import evaluate
+from latticebench.systems.stencil import evaluate
 from latticebench.systems.terms import Term
+from latticebench.systems.user_files import load_effects
 
 ISSUE = """
 damping quadratic-drag dry-friction onsite-linear onsite-quadratic onsite-cubic onsite-quintic constant-force drive
@@ -116,7 +117,7 @@ source = "me"
 def test_a_users_own_catalogue_is_read(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(GOOD)
-    drag, twist = load(path)
+    drag, twist = load_effects(path)
     assert drag == Effect(
         "cubic-drag", "v[n]**3", orders=(2,), look_for="amplitudes that fall as one over the root of time"
     )
@@ -157,7 +158,7 @@ def test_a_bad_entry_is_refused_by_file_number_and_fault(tmp_path, entry, says):
     path = tmp_path / "mine.toml"
     path.write_text(f"[[effect]]\n{BASE}{entry}\n")
     with pytest.raises(InputError) as caught:
-        load(path)
+        load_effects(path)
     text = str(caught.value)
     assert "mine.toml: effect 2" in text
     assert says in text
@@ -182,11 +183,11 @@ def test_a_file_that_is_no_catalogue_is_refused_by_name_and_fault(tmp_path, cont
     path = tmp_path / "mine.toml"
     path.write_text(content)
     with pytest.raises(InputError) as caught:
-        load(path)
+        load_effects(path)
     assert "mine.toml" in str(caught.value)
     assert says in str(caught.value)
 
 
 def test_a_catalogue_that_is_not_there_is_refused_by_name(tmp_path):
     with pytest.raises(InputError, match=r"nowhere\.toml"):
-        load(tmp_path / "nowhere.toml")
+        load_effects(tmp_path / "nowhere.toml")

@@ -8,19 +8,11 @@ import pytest
 
 from latticebench import systems
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import (
-    Initial,
-    Library,
-    System,
-    evaluate,
-    ghosts,
-    library,
-    load,
-    load_module,
-    motion,
-    observed,
-)
+from latticebench.systems.lattice import Initial, Library, System, library
+from latticebench.systems.motion import motion
+from latticebench.systems.stencil import evaluate, ghosts, observed
 from latticebench.systems.terms import Term, split
+from latticebench.systems.user_files import load_module, load_system
 
 ENDS = ("free", "fixed", "periodic", "antiperiodic")
 
@@ -410,7 +402,7 @@ def test_a_system_from_a_python_file_is_found(tmp_path):
 def test_each_mistake_in_a_toml_file_is_one_line_that_names_file_and_key(tmp_path, changes, key):
     path = write_toml(tmp_path / "wrong.toml", **changes)
     with pytest.raises(InputError) as caught:
-        load(path)
+        load_system(path)
     message = str(caught.value)
     assert str(path) in message
     assert key in message.replace(str(path), "")
@@ -430,7 +422,7 @@ def test_a_file_that_is_no_toml_is_named(tmp_path, content, words):
     path = tmp_path / "wrong.toml"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words) as caught:
-        load(path)
+        load_system(path)
     assert str(path) in str(caught.value)
 
 
@@ -451,7 +443,7 @@ def test_each_mistake_in_a_python_file_is_one_error_that_names_it(tmp_path, cont
     path = tmp_path / "wrong.py"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words) as caught:
-        load(path)
+        load_system(path)
     assert str(path) in str(caught.value)
 
 

@@ -16,9 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from latticebench.systems import files, samples
+from latticebench.systems import files
 from latticebench.systems.errors import InputError
-from latticebench.systems.samples import FORMATS, Samples, SimulatedSamples, read, read_all, write
+from latticebench.systems.readers import FORMATS, read, read_all
+from latticebench.systems.samples import Samples, SimulatedSamples
+from latticebench.systems.writers import write
 
 # Round trips ----------------------------------------------------------------------------------------------------------------
 
@@ -422,7 +424,8 @@ def test_a_full_disk_leaves_the_old_file_as_it_was(tmp_path, suffix):
         import numpy as np
         import pandas, pyarrow.parquet
         from latticebench.systems.errors import InputError
-        from latticebench.systems.samples import Samples, write
+        from latticebench.systems.samples import Samples
+        from latticebench.systems.writers import write
         u = np.random.default_rng(0).normal(size=(3000, 5))
         resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
         try:
@@ -557,4 +560,4 @@ def test_simulated_samples_derive_their_truth_and_observed_ones_have_none():
 
 
 def test_the_formats_are_the_designs():
-    assert samples.FORMATS == (".csv", ".npz", ".parquet")
+    assert FORMATS == (".csv", ".npz", ".parquet")

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from latticebench import systems
-from latticebench.systems.lattice import Motion, evaluate, motion
+from latticebench.systems.motion import Motion, motion
 from latticebench.systems.samples import SimulatedSamples
 from latticebench.systems.simulate import simulate
+from latticebench.systems.stencil import evaluate
 from latticebench.systems.terms import Term
 
 ROOT = Path(__file__).parents[2]

@@ -15,22 +15,10 @@ from hypothesis import strategies as st
 from matplotlib.mathtext import MathTextParser
 
 from latticebench import systems
+from latticebench.systems.compiler import Slot, compiled, partials
 from latticebench.systems.errors import InputError
-from latticebench.systems.terms import (
-    FUNCTIONS,
-    MAX_LENGTH,
-    MAX_OFFSET,
-    MAX_POWER,
-    Slot,
-    Term,
-    TermError,
-    combination,
-    compiled,
-    express,
-    partials,
-    split,
-    substitute,
-)
+from latticebench.systems.parser import FUNCTIONS, MAX_LENGTH, MAX_OFFSET, MAX_POWER, TermError
+from latticebench.systems.terms import Term, combination, express, split, substitute
 
 matplotlib.use("Agg")
 

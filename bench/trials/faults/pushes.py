@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.trials.faults.setting import Drawn, Push, Setting
-from latticebench.systems.lattice import Motion, ghosts
+from latticebench.systems.motion import Motion
+from latticebench.systems.stencil import ghosts
 
 if TYPE_CHECKING:
     from numpy import ndarray

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Ends, Motion
+from latticebench.systems.motion import Motion
+from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
     from jaxtyping import Float

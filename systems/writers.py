@@ -1,0 +1,70 @@
+"""Writing samples to files, in the forms that `readers` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.systems.errors import InputError
+from latticebench.systems.files import whole
+from latticebench.systems.readers import check_ending
+from latticebench.systems.samples import Samples, check_alike
+
+if TYPE_CHECKING:
+    import pandas
+    from numpy import ndarray
+
+
+def write(data: Sequence[Samples], path: Path) -> None:
+    """Write trajectories to one CSV, NPZ or Parquet file, whole or not at all; numbers keep all their digits.
+
+    Raises:
+        InputError: the ending is unknown, the trajectories differ in sites or columns, or the file cannot be written.
+    """
+    check_ending(path)
+    check_alike(data)
+    with whole(path) as temporary:
+        match path.suffix.lower():
+            case ".npz":
+                # NumPy appends .npz to a path that ends otherwise, in capitals too.
+                with temporary.open("wb") as handle:
+                    np.savez_compressed(handle, allow_pickle=False, **_arrays(data))
+            case ".csv":
+                _table(data).to_csv(temporary, index=False)
+            case _:
+                _table(data).to_parquet(temporary, index=False)
+
+
+def _arrays(data: Sequence[Samples]) -> dict[str, ndarray]:
+    """Return the arrays of an NPZ file."""
+    arrays = {"t": np.concatenate([samples.t for samples in data])}
+    for name in ("u", "v", "f"):
+        found = [getattr(samples, name) for samples in data]
+        if found[0] is not None:
+            arrays[name] = np.concatenate(found)
+    if len(data) > 1:
+        arrays["trajectory"] = np.repeat(np.arange(1, len(data) + 1), [len(samples.t) for samples in data])
+    return arrays
+
+
+def _table(data: Sequence[Samples]) -> pandas.DataFrame:
+    """Return the table of a CSV or Parquet file."""
+    import pandas as pd
+
+    tables = []
+    for number, samples in enumerate(data, start=1):
+        if samples.is_complex and samples.v is not None:
+            raise InputError("a complex field with velocities has no form in tables; write it as .npz")
+        columns: dict[str, ndarray] = {"t": samples.t}
+        fields = [("re", samples.u.real), ("im", samples.u.imag)] if samples.is_complex else [("u", samples.u)]
+        fields += [(name, array) for name, array in (("v", samples.v), ("f", samples.f)) if array is not None]
+        for name, array in fields:
+            columns.update({f"{name}{site + 1}": array[:, site] for site in range(samples.sites)})
+        table = pd.DataFrame(columns)
+        if len(data) > 1:
+            table.insert(0, "trajectory", number)
+        tables.append(table)
+    return pd.concat(tables, ignore_index=True)
