@@ -1,17 +1,16 @@
-"""The catalogue of effects: every text is sound, the issue's list is whole, and a user's own file is read or refused."""
+"""The catalogue of effects: every text has a value on its lattices, and the list is complete."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from latticebench.systems.effects import CATALOGUE, Effect, find
+from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.errors import InputError
 from latticebench.systems.stencil import evaluate
 from latticebench.systems.terms import Term
-from latticebench.systems.user_files import load_effects
 
-ISSUE = """
+EXPECTED = """
 damping quadratic-drag dry-friction onsite-linear onsite-quadratic onsite-cubic onsite-quintic constant-force drive
 parametric-drive known-input gradient trap memory kick next-neighbour nonlinear-coupling asymmetric-coupling
 intersite-nonlinearity long-range nonlinear-loss gain-loss defect unequal-masses ends disorder sensor-offset sensor-gain
@@ -48,7 +47,7 @@ def test_no_two_effects_have_the_same_name():
 
 
 def test_the_catalogue_has_every_effect_that_was_asked_for_and_each_says_what_to_look_for_and_where_to_read():
-    assert {one.name for one in CATALOGUE} >= set(ISSUE.split())
+    assert {one.name for one in CATALOGUE} >= set(EXPECTED.split())
     assert all(one.look_for and one.source for one in CATALOGUE)
 
 
@@ -72,7 +71,8 @@ def test_a_complex_coefficient_is_two_terms_t_and_i_times_t_unless_the_name_says
     ("name", "order", "is_complex", "text"),
     [
         ("damping", 2, False, "v[n]"), ("damping", 1, True, "u[n]"), ("gradient", 2, False, "n"),
-        ("gradient", 1, True, "n*u[n]"), ("onsite-cubic", 1, True, "abs(u[n])**2*u[n]"), ("onsite-cubic", 2, False, "u[n]**3"),
+        ("gradient", 1, True, "n*u[n]"), ("onsite-cubic", 1, True, "abs(u[n])**2*u[n]"),
+        ("onsite-cubic", 2, False, "u[n]**3"),
     ],
 )  # fmt: skip
 def test_the_same_effect_reads_differently_on_different_lattices(name, order, is_complex, text):
@@ -95,99 +95,3 @@ def test_effects_of_complex_fields_are_not_for_real_ones(name):
 def test_an_unknown_name_is_refused_with_one_that_is_near():
     with pytest.raises(InputError, match="dry-friction"):
         find("dry-frction")
-
-
-GOOD = """
-[[effect]]
-name = "cubic-drag"
-formula = "v[n]**3"
-orders = [2]
-look_for = "amplitudes that fall as one over the root of time"
-
-[[effect]]
-name = "twist"
-formula = "u[n+1]-u[n-1]"
-complex_field = "conj(u[n])"
-acts = "harmonic"
-real = true
-source = "me"
-"""
-
-
-def test_a_users_own_catalogue_is_read(tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(GOOD)
-    drag, twist = load_effects(path)
-    assert drag == Effect(
-        "cubic-drag", "v[n]**3", orders=(2,), look_for="amplitudes that fall as one over the root of time"
-    )
-    assert drag.texts(1, False) == ()
-    assert twist.acts == "harmonic"
-    assert twist.texts(1, True) == ("conj(u[n])",)
-
-
-BASE = 'name = "first"\nformula = "u[n]"\n\n[[effect]]\n'
-
-
-@pytest.mark.parametrize(
-    ("entry", "says"),
-    [
-        ('name = "mine"\nformula = "u[n]"\ncolour = "red"', "colour"),
-        ('name = "mine"', "formula"),
-        ('formula = "u[n]"', "name"),
-        ('name = "mine"\nformula = 3', "formula"),
-        ('name = "mine"\nformula = "u[n"', "mine"),
-        ('name = "mine"\nformula = "__import__(1)"', "mine"),
-        ('name = "mine"\nformula = "u[n]"\ncomplex_field = "q[n]"', "mine"),
-        ('name = "My Effect"\nformula = "u[n]"', "My Effect"),
-        ('name = "mine"\nformula = "u[n]"\nacts = "sometimes"', "sometimes"),
-        ('name = "mine"\nformula = "u[n]"\nacts = 3', "acts"),
-        ('name = "mine"\nformula = "u[n]"\norders = [3]', "orders"),
-        ('name = "mine"\nformula = "u[n]"\norders = []', "orders"),
-        ('name = "mine"\nformula = "u[n]"\norders = 2', "orders"),
-        ('name = "mine"\nformula = "u[n]"\norders = ["2"]', "orders"),
-        ('name = "mine"\nformula = "u[n]"\norders = [[1]]', "orders"),
-        ('name = "mine"\nformula = "u[n]"\norders = [true]', "orders"),
-        ('name = "mine"\nformula = ""', "mine"),
-        ('name = "mine"\nformula = "u[n]"\nreal = 1', "real"),
-        ('name = "mine"\nformula = "u[n]"\ntakes = "yes"', "takes"),
-        ('name = "mine"\nformula = "u[n]"\nlook_for = 1', "look_for"),
-    ],
-)
-def test_a_bad_entry_is_refused_by_file_number_and_fault(tmp_path, entry, says):
-    path = tmp_path / "mine.toml"
-    path.write_text(f"[[effect]]\n{BASE}{entry}\n")
-    with pytest.raises(InputError) as caught:
-        load_effects(path)
-    text = str(caught.value)
-    assert "mine.toml: effect 2" in text
-    assert says in text
-    assert "\n" not in text
-
-
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        (f'[[effect]]\n{BASE}name = "first"\nformula = "v[n]"', "first"),
-        ('[[effect]]\nname = "damping"\nformula = "v[n]"', "damping"),
-        ('effect = "damping"', "[[effect]]"),
-        ("effect = []", "[[effect]]"),
-        ("effect = [3]", "effect 1"),
-        ('[effect]\nname = "mine"\nformula = "u[n]"', "[[effect]]"),
-        ("", "[[effect]]"),
-        ('[[efect]]\nname = "mine"\nformula = "u[n]"', "efect"),
-        ("[[effect", "mine.toml"),
-    ],
-)
-def test_a_file_that_is_no_catalogue_is_refused_by_name_and_fault(tmp_path, content, says):
-    path = tmp_path / "mine.toml"
-    path.write_text(content)
-    with pytest.raises(InputError) as caught:
-        load_effects(path)
-    assert "mine.toml" in str(caught.value)
-    assert says in str(caught.value)
-
-
-def test_a_catalogue_that_is_not_there_is_refused_by_name(tmp_path):
-    with pytest.raises(InputError, match=r"nowhere\.toml"):
-        load_effects(tmp_path / "nowhere.toml")

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 PAPER = ("dnls", "ginzburg-landau", "phi4", "sine-gordon")
 LIBRARIES = [(name, library.name) for name in systems.names() for library in systems.find(name).libraries]
 
-# The contract ---------------------------------------------------------------------------------------------------------------
+# The contract
 
 
 def test_the_papers_four_systems_are_there():
@@ -123,7 +123,7 @@ def test_the_same_call_gives_the_same_samples_to_the_last_digit(name):
     np.testing.assert_array_equal(first.rate, again.rate)
 
 
-# What the paper says --------------------------------------------------------------------------------------------------------
+# What the paper says
 
 
 def grid(count, coupling):
@@ -241,7 +241,7 @@ def test_the_equations_do_not_change_when_the_chain_is_turned_round(name):
     np.testing.assert_allclose(rates[0], rates[1][::-1], atol=1e-13)
 
 
-# Imports --------------------------------------------------------------------------------------------------------------------
+# Imports
 
 
 def test_listing_the_systems_loads_no_heavy_package():

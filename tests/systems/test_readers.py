@@ -1,0 +1,401 @@
+"""Reading: what was written is read to the last digit, and what is invalid is refused by its place."""
+
+import decimal
+import pickle
+import zipfile
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from latticebench.systems.errors import InputError
+from latticebench.systems.readers import FORMATS, read, read_all
+from latticebench.systems.samples import Samples
+from latticebench.systems.writers import write
+
+# Round trips
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+REAL = st.one_of(FINITE, st.just(float("nan")))
+
+
+@st.composite
+def data_sets(draw):
+    count = draw(st.integers(1, 4))
+    is_complex = draw(st.booleans())
+    with_v, with_f = draw(st.booleans()) and not is_complex, draw(st.booleans())
+    found = []
+    for _ in range(draw(st.integers(1, 3))):
+        rows = draw(st.integers(2, 6))
+        t = np.array(sorted(draw(st.lists(FINITE, min_size=rows, max_size=rows, unique_by=lambda x: x + 0.0))))
+
+        def field(rows=rows):
+            return draw(hnp.arrays(float, (rows, count), elements=REAL))
+
+        u = field()
+        if is_complex:
+            imaginary = field()
+            u = np.where(np.isnan(u) | np.isnan(imaginary), complex(np.nan, np.nan), u + 1j * imaginary)
+        u[0, 0] = 1.25
+        found.append(Samples(t, u, field() if with_v else None, field() if with_f else None))
+    return found
+
+
+def assert_same(got, wanted):
+    assert len(got) == len(wanted)
+    for one, other in zip(got, wanted, strict=True):
+        np.testing.assert_array_equal(one.t, other.t)
+        for name in ("u", "v", "f"):
+            a, b = getattr(one, name), getattr(other, name)
+            assert (a is None) == (b is None)
+            if a is not None:
+                assert a.dtype == b.dtype
+                np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@given(data=data_sets())
+@settings(derandomize=True, max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_what_is_written_is_read_again_to_the_last_digit(tmp_path, suffix, data):
+    path = tmp_path / f"data{suffix}"
+    write(data, path)
+    assert_same(read(path), data)
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_random_digits_over_all_magnitudes_survive(tmp_path, suffix):
+    draw = np.random.default_rng(0)
+    u = draw.normal(size=(500, 3)) * 10.0 ** draw.integers(-300, 300, (500, 3))
+    data = [Samples(np.cumsum(draw.uniform(1e-9, 1, 500)), u)]
+    write(data, tmp_path / f"data{suffix}")
+    assert_same(read(tmp_path / f"data{suffix}"), data)
+
+
+def test_the_upper_case_of_an_ending_is_the_same_format(tmp_path):
+    data = [Samples(np.arange(3.0), np.ones((3, 2)))]
+    for suffix in FORMATS:
+        write(data, tmp_path / f"data{suffix.upper()}")
+        assert_same(read(tmp_path / f"data{suffix.upper()}"), data)
+
+
+def test_a_complex_field_with_velocities_goes_into_npz_only(tmp_path):
+    data = [Samples(np.arange(2.0), np.ones((2, 2)) * 1j, np.ones((2, 2)) * (1 + 2j))]
+    write(data, tmp_path / "data.npz")
+    assert_same(read(tmp_path / "data.npz"), data)
+    for suffix in (".csv", ".parquet"):
+        with pytest.raises(InputError, match="npz"):
+            write(data, tmp_path / f"data{suffix}")
+        assert not (tmp_path / f"data{suffix}").exists()
+
+
+def test_a_table_as_the_design_has_it_is_read(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("# measured on a Monday\nt, u2, u1, f\n0, 2, 1, 0.5\n0.1,, 1.5, nan\n", encoding="utf-8")
+    (one,) = read(path, "free")
+    np.testing.assert_array_equal(one.u, [[1, 2], [1.5, np.nan]])
+    np.testing.assert_array_equal(one.f, [[0.5, 0.5], [np.nan, np.nan]])
+    assert one.v is None
+    assert one.ends == "free"
+    assert one.source == str(path)
+
+
+def test_a_column_trajectory_splits_a_file_in_the_order_of_first_appearance(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("trajectory,t,u1\nb,0,1\na,0,10\nb,1,2\na,1,20\na,2,30\n")
+    first, second = read(path)
+    np.testing.assert_array_equal(first.u[:, 0], [1, 2])
+    np.testing.assert_array_equal(second.u[:, 0], [10, 20, 30])
+    assert "trajectory b" in first.source
+    assert str(path) in first.source
+
+
+def test_a_byte_order_mark_does_not_hide_the_first_column(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_bytes(b"\xef\xbb\xbft,u1\r\n0,1\r\n1,2\r\n")
+    np.testing.assert_array_equal(read(path)[0].u, [[1], [2]])
+
+
+def test_an_npz_of_whole_numbers_and_one_site_is_read(tmp_path):
+    np.savez(tmp_path / "a.npz", t=np.arange(3), u=np.array([1, 2, 3]), f=np.array([4, 5, 6]))
+    (one,) = read(tmp_path / "a.npz")
+    np.testing.assert_array_equal(one.u, [[1.0], [2.0], [3.0]])
+    assert one.t.dtype == one.u.dtype == one.f.dtype == float
+
+
+def test_other_number_types_of_parquet_are_read(tmp_path):
+    path = tmp_path / "a.parquet"
+    table = {
+        "t": pa.array([0, 1], pa.int32()),
+        "u1": [decimal.Decimal("1.5"), None],
+        "u2": pa.array([1, None], pa.int64()),
+        "u3": pa.array([0.5, 1.5], pa.float32()),
+    }
+    pq.write_table(pa.table(table), path)
+    np.testing.assert_array_equal(read(path)[0].u, [[1.5, 1, 0.5], [np.nan, np.nan, 1.5]])
+
+
+# Bad files
+
+
+def refused(path, *words):
+    with pytest.raises(InputError) as caught:
+        read(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+    return message
+
+
+def data_or_error(path):
+    """Read a file that may be sound or not: the data and the message, one of them empty."""
+    try:
+        return read(path), ""
+    except InputError as error:
+        return [], str(error)
+
+
+BAD_TABLES = {
+    "no t": ("u1,u2\n0,1\n1,2\n", ["no column t"]),
+    "no u": ("t\n0\n1\n", ["u1..uN"]),
+    "text in a number column": ("t,u1,u2\n0,1,2\n1,2,three\n", ["row 2", "column u2", "'three'"]),
+    "text in t": ("t,u1\n0,1\nnoon,2\n", ["row 2", "column t", "'noon'"]),
+    "a decimal comma": ('t,u1\n0,"1,5"\n1,2\n', ["row 1", "column u1"]),
+    "a truth value": ("t,u1\n0,True\n1,2\n", ["row 1", "column u1", "'True'"]),
+    "times that do not increase": ("t,u1\n0,1\n1,2\n0.5,3\n", ["row 3", "column t", "0.5 after 1"]),
+    "a time twice": ("t,u1\n0,1\n1,2\n1,3\n", ["row 3", "column t"]),
+    "a missing time": ("t,u1\n0,1\n,2\n2,3\n", ["row 2", "column t"]),
+    "an endless time": ("t,u1\n0,1\ninf,2\n", ["row 2", "column t"]),
+    "one row": ("t,u1\n0,1\n", ["1 row"]),
+    "no rows": ("t,u1\n", ["0 row"]),
+    "all NaN": ("t,u1,u2\n0,,nan\n1,nan,\n", ["every value of u is missing"]),
+    "an infinite value": ("t,u1,u2\n0,1,2\n1,-inf,2\n", ["row 2", "column u1", "infinite"]),
+    "sites of u and v differ": ("t,u1,u2,v1\n0,1,2,3\n1,1,2,3\n", ["u has 2 sites", "v"]),
+    "sites of re and im differ": ("t,re1,re2,im1\n0,1,2,3\n1,1,2,3\n", ["2 columns re", "1 columns im"]),
+    "re without im": ("t,re1\n0,1\n1,1\n", ["re1..reN and im1..imN"]),
+    "u and re": ("t,u1,re1,im1\n0,1,1,1\n1,1,1,1\n", ["either"]),
+    "a column twice": ("t,u1,u1\n0,1,2\n1,2,3\n", ["'u1' occurs twice"]),
+    "t twice": ("t,u1, t\n0,1,2\n1,2,3\n", ["'t' occurs twice"]),
+    "a gap in the site numbers": ("t,u1,u3\n0,1,2\n1,2,3\n", ["column u2 is missing"]),
+    "sites from zero": ("t,u0,u1\n0,1,2\n1,2,3\n", ["'u0'"]),
+    "an unknown column": ("t,u1,speed\n0,1,2\n1,2,3\n", ["unknown column 'speed'"]),
+    "f and f1": ("t,u1,f,f1\n0,1,2,3\n1,2,3,4\n", ["both f and f1"]),
+    "a long row": ("t,u1\n0,1\n1,2,3\n", ["line 3"]),
+    "a short row": ("t,u1,u2\n0,1,2\n1,2\n2,3,4\n", ["row 2", "2 value(s)"]),
+    "cut off in the last row": ("t,u1,u2\n0,1,2\n1,2,3\n2,", ["row 3", "2 value(s)"]),
+    "semicolons": ("t;u1\n0;1\n1;2\n", ["separate them by commas"]),
+    "an open quote": ('t,u1\n"0,1\n1,2\n', ["not a table"]),
+    "blank lines only": ("\n\n", ["empty"]),
+    "a remark only": ("# t,u1\n", ["empty"]),
+    "one bad trajectory": ("trajectory,t,u1\na,0,1\na,1,2\nb,0,1\n", ["trajectory b", "1 row"]),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TABLES)
+def test_a_bad_table_is_told_by_file_and_place(tmp_path, name):
+    text, words = BAD_TABLES[name]
+    path = tmp_path / "bad.csv"
+    path.write_text(text, encoding="utf-8")
+    refused(path, *words)
+
+
+def test_rows_that_end_early_are_told_apart_from_gaps(tmp_path):
+    path = tmp_path / "gaps.csv"
+    path.write_text("t,u1,u2\n0,1,\n# a remark\n1,,\n2,3,4\n")
+    np.testing.assert_array_equal(read(path)[0].u, [[1, np.nan], [np.nan, np.nan], [3, 4]])
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_an_empty_file_a_folder_and_a_missing_file_are_told(tmp_path, suffix):
+    empty, folder = tmp_path / f"empty{suffix}", tmp_path / f"folder{suffix}"
+    empty.touch()
+    folder.mkdir()
+    refused(empty, "empty")
+    refused(folder, "folder")
+    refused(tmp_path / f"gone{suffix}", "no such file")
+
+
+def test_an_unknown_ending_is_told(tmp_path):
+    path = tmp_path / "data.xlsx"
+    path.write_text("t,u1\n0,1\n1,2\n")
+    refused(path, "'.xlsx'", ".csv")
+    with pytest.raises(InputError, match=r"\.xlsx"):
+        write([Samples(np.arange(2.0), np.ones((2, 1)))], path)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("seed", range(6))
+def test_binary_garbage_is_refused_in_every_format(tmp_path, suffix, seed):
+    path = tmp_path / f"garbage{suffix}"
+    draw = np.random.default_rng(seed)
+    path.write_bytes(bytes(draw.integers(0, 256, 10 ** (1 + seed % 4), dtype=np.uint8)))
+    refused(path)
+
+
+@given(content=st.binary(min_size=1, max_size=200))
+@settings(derandomize=True, max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_bytes_are_data_or_an_input_error(tmp_path, content):
+    for suffix in FORMATS:
+        path = tmp_path / f"any{suffix}"
+        path.write_bytes(content)
+        found, told = data_or_error(path)
+        assert found or told.startswith(str(path))
+
+
+@given(text=st.text(alphabet='tuv12,.\n-#e "na', max_size=60).map("t,u1,u2\n0,1,2\n".__add__))
+@settings(
+    derandomize=True, max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+def test_any_table_is_data_or_an_input_error(tmp_path, text):
+    path = tmp_path / "any.csv"
+    path.write_text(text, encoding="utf-8")
+    found, told = data_or_error(path)
+    assert (len(found) == 1 and found[0].sites == 2) or told.startswith(str(path))
+
+
+def test_a_pickled_npz_is_never_loaded(tmp_path):
+    proof = tmp_path / "proof"
+
+    class Bomb:
+        def __reduce__(self):
+            return (open, (str(proof), "w"))
+
+    path = tmp_path / "bomb.npz"
+    np.savez(path, t=np.arange(2.0), u=np.array([Bomb()], dtype=object))
+    refused(path, "pickled", "numpy.savez")
+    path.write_bytes(pickle.dumps(Bomb()))
+    refused(path, "pickled")
+    assert not proof.exists()
+
+
+def test_a_damaged_npz_is_refused_wherever_a_bit_is_flipped(tmp_path):
+    path = tmp_path / "a.npz"
+    data = [Samples(np.arange(4.0), np.random.default_rng(0).normal(size=(4, 2)))]
+    write(data, path)
+    whole = path.read_bytes()
+    for place in range(0, len(whole), 3):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0x5A
+        path.write_bytes(bytes(damaged))
+        found, told = data_or_error(path)
+        if not told:
+            assert_same(found, data)
+        else:
+            assert told.startswith(str(path))
+    for end in range(1, len(whole), 7):
+        path.write_bytes(whole[:end])
+        refused(path)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "words"),
+    [
+        ({"u": np.ones((2, 1))}, ["'t' is missing"]),
+        ({"t": np.arange(2.0)}, ["'u' is missing"]),
+        ({"t": np.arange(2.0), "u": np.ones((2, 1)), "w": np.ones(2)}, ["unknown array 'w'"]),
+        ({"t": np.arange(2.0), "u": np.array([["a"], ["b"]])}, ["array u", "not numbers"]),
+        ({"t": np.arange(2.0) * 1j, "u": np.ones((2, 1))}, ["array t", "real"]),
+        ({"t": np.ones((2, 1)), "u": np.ones((2, 1))}, ["array t", "(2, 1)"]),
+        ({"t": np.arange(3.0), "u": np.ones((2, 1))}, ["array u", "3 times"]),
+        ({"t": np.arange(2.0), "u": np.ones((2, 1, 1))}, ["array u", "(2, 1, 1)"]),
+        ({"t": np.arange(2.0), "u": np.ones((2, 3)), "v": np.ones((2, 2))}, ["3 sites", "v has shape"]),
+        ({"t": np.arange(2.0), "u": np.ones((2, 3)), "v": 1j * np.ones((2, 3))}, ["v is complex"]),
+        ({"t": np.arange(2.0), "u": np.ones((2, 3)), "f": 1j * np.ones((2, 3))}, ["f is complex"]),
+        ({"t": np.arange(2.0), "u": np.ones((2, 0))}, ["no sites"]),
+        ({"t": np.arange(1.0), "u": np.ones((1, 2))}, ["1 row"]),
+        ({"t": np.array([0.0, 0.0]), "u": np.ones((2, 2))}, ["row 2", "column t"]),
+        ({"t": np.arange(2.0), "u": np.full((2, 2), np.nan)}, ["every value of u is missing"]),
+        ({"t": np.arange(2.0), "u": np.array([[1, 2], [3, np.inf]])}, ["row 2", "column u2"]),
+        ({"t": np.arange(2.0), "u": np.ones((2, 2)), "trajectory": np.ones(3)}, ["trajectory", "(3,)"]),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else None,
+)
+def test_an_npz_with_the_wrong_arrays_is_told_by_file_and_array(tmp_path, arrays, words):
+    path = tmp_path / "bad.npz"
+    np.savez(path, **arrays)
+    refused(path, *words)
+
+
+def test_other_files_under_the_name_of_an_npz_are_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    with path.open("wb") as handle:
+        np.save(handle, np.arange(4.0))
+    refused(path, "NPZ")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("t.npy", "not an array")
+        archive.writestr("u.npy", "nor this one")
+    refused(path, "'t' is not an array")
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"t": [0.0, 1.0], "u1": ["a", "b"]}, ["row 1", "column u1"]),
+        ({"t": [0.0, 1.0], "u1": [[1.0], [2.0]]}, ["row 1", "column u1"]),
+        ({"t": [0.0, 1.0], "u1": [{"a": 1}, {"a": 2}]}, ["row 1", "column u1"]),
+        ({"t": [0.0, 1.0], " t": [0.0, 1.0], "u1": [1.0, 2.0]}, ["'t' occurs twice"]),
+        ({"t": pd.to_datetime(["2020-01-01", "2020-01-02"]), "u1": [1.0, 2.0]}, ["column t", "dates"]),
+        ({"u1": [1.0, 2.0]}, ["no column t"]),
+        ({"t": [0.0, 1.0], "u1": pa.array([None, None], pa.float64())}, ["every value of u is missing"]),
+        ({"t": [1.0, 0.0], "u1": [1.0, 2.0]}, ["row 2", "column t"]),
+        ({"t": [0.0], "u1": [1.0]}, ["1 row"]),
+    ],
+    ids=["a text", "lists", "structures", "twice", "dates", "no t", "all missing", "backwards", "one row"],
+)
+def test_a_bad_parquet_is_told_by_file_and_place(tmp_path, table, words):
+    path = tmp_path / "bad.parquet"
+    pq.write_table(pa.table(table), path)
+    refused(path, *words)
+
+
+def test_a_cut_parquet_is_refused(tmp_path):
+    path = tmp_path / "a.parquet"
+    write([Samples(np.arange(4.0), np.ones((4, 2)))], path)
+    whole = path.read_bytes()
+    for end in range(1, len(whole), 101):
+        path.write_bytes(whole[:end])
+        refused(path, "Parquet")
+
+
+# Several files
+
+
+def some(sites=2, is_complex=False, v=False, f=False):
+    u = np.ones((3, sites)) * (1j if is_complex else 1.0)
+    return Samples(np.arange(3.0), u, np.ones((3, sites)) if v else None, np.ones((3, sites)) if f else None)
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        ({"sites": 3}, "3 sites"),
+        ({"is_complex": True}, "complex"),
+        ({"v": True}, "v1..vN"),
+        ({"f": True}, "f1..fN"),
+    ],
+)
+def test_files_that_do_not_fit_together_are_refused_by_their_names(tmp_path, other, words):
+    first, second = tmp_path / "first.csv", tmp_path / "second.csv"
+    write([some()], first)
+    write([some(**other)], second)
+    with pytest.raises(InputError, match=words) as caught:
+        read_all([first, second])
+    assert str(first) in str(caught.value)
+    assert str(second) in str(caught.value)
+
+
+def test_files_of_different_lengths_fit_together(tmp_path):
+    write([some()], tmp_path / "a.csv")
+    write([Samples(np.arange(5.0), np.ones((5, 2)))], tmp_path / "b.npz")
+    assert [len(one.t) for one in read_all([tmp_path / "a.csv", tmp_path / "b.npz"])] == [3, 5]
+
+
+def test_the_formats_are_the_designs():
+    assert FORMATS == (".csv", ".npz", ".parquet")
