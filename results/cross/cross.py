@@ -1,12 +1,13 @@
-"""Say what the whole cross of noise, samples, sites and libraries shows, from the published summary of the suite `cross`; write cross.md.
+"""Summarise the suite `cross`, in which noise, samples, sites and libraries are all crossed, and write cross.md.
 
     latticebench run cross
     latticebench table runs/cross --only summary --only errors --out results/cross
     python results/cross/cross.py
 
-Every figure is computed from summary.csv beside this file, which has a row for each kind of data, library and method. E2 is the relative error of
-the coefficients, the bound its smallest root-mean-square for an unbiased method that keeps every term (Cramer-Rao). A method that selects
-terms may go below it; and a single draw scatters about it.
+Every figure is computed from summary.csv beside this file, which has one row per kind of data, library and method. E2
+is the relative error of the coefficients; the bound is the smallest root-mean-square of E2 that an unbiased method can
+have if it keeps every term (Cramer-Rao). A method that selects terms can have a smaller error, and so can a single
+draw of the noise.
 """
 
 from __future__ import annotations
@@ -15,19 +16,21 @@ from pathlib import Path
 
 import pandas as pd
 
-from latticebench.bench.publish import format_number
+from latticebench.bench.publish import format_number, render
 from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent
 OWN = ("lib2", "four")
 METHODS = ("trajectory", "weak", "stlsq", "sr3")
-# What a kind of data does not say, as the suite's files leave it out.
+# The values of settings that the name of a kind of data leaves out.
 USUAL = {"samples": 50, "sites": 31, "noise": 0.0}
+VARIED = {"noise": "noise level", "samples": "number of samples", "sites": "number of sites", "system": "system"}
+# A fit is lost when its E2 exceeds this multiple of the bound.
 LOST = 4.0
 
 
 def load(path: Path) -> pd.DataFrame:
-    """Read the summary, and add what each kind of data is: system, noise, samples and sites."""
+    """Read the summary and add what the names of data and library say, E2 / bound, and whether the support is right."""
     table = pd.read_csv(path, comment="#")
     table["system"] = table["data"].str.split().str[0]
     for name, usual in USUAL.items():
@@ -38,69 +41,75 @@ def load(path: Path) -> pd.DataFrame:
     return table
 
 
-def methods(noisy: pd.DataFrame) -> pd.DataFrame:
-    """Compare the methods over all kinds of data with noise."""
+def by_method(noisy: pd.DataFrame) -> pd.DataFrame:
+    """Compare the methods over all kinds of data with noise, for own terms and large libraries."""
     groups = noisy.groupby(["own", "method"])
-    told = pd.DataFrame({
+    compared = pd.DataFrame({
         "kinds of data": groups.size(),
         "E2 / bound, median": groups["ratio"].median(),
-        "90 % below": groups["ratio"].quantile(0.9),
+        "90th percentile": groups["ratio"].quantile(0.9),
         "largest": groups["ratio"].max(),
-        "terms right": groups["right"].mean(),
+        "right support": groups["right"].mean(),
         "seconds, median": groups["seconds"].median(),
         "largest seconds": groups["seconds"].max(),
     })  # fmt: skip
-    return told.loc[[(own, name) for own in (True, False) for name in METHODS]].rename(
-        index={True: "own terms", False: "large"}, level="own"
-    )
+    compared = compared.loc[[(own, name) for own in (True, False) for name in METHODS]]
+    return compared.rename(index={True: "own terms", False: "large"}, level="own").rename_axis(["library", "method"])
 
 
-def spread(noisy: pd.DataFrame, by: str) -> pd.DataFrame:
-    """Give the median error over the bound with the lattice's own terms, by one thing that the cross varies."""
+def by_setting(noisy: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Return the median of E2 / bound with the own terms, methods against the values of one setting."""
     own = noisy[noisy["own"]]
-    return own.pivot_table(index="method", columns=by, values="ratio", aggfunc="median").loc[list(METHODS)]
+    return own.pivot_table(index="method", columns=name, values="ratio", aggfunc="median").loc[list(METHODS)]
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """Write a table as Markdown, numbers with two digits."""
+    """Return a table and its index as Markdown, numbers with two digits."""
     flat = table.reset_index()
-    flat.columns = [f"{name:g}" if isinstance(name, float) else str(name) for name in flat.columns]
-    cells = flat.astype(object).map(lambda cell: format_number(cell) if isinstance(cell, float) else str(cell))
-    return cells.to_markdown(index=False, disable_numparse=True)
+    flat.columns = pd.Index([f"{name:g}" if isinstance(name, float) else str(name) for name in flat.columns])
+    return render(flat, {}, "md").rstrip()
 
 
-def page(table: pd.DataFrame) -> str:
-    """Write the page."""
+def lost_fits(trajectory: pd.DataFrame) -> str:
+    """List the lost fits of `trajectory`, one per line."""
+    lost = trajectory[trajectory["ratio"] > LOST]
+    lines = [f"- {row.data} ({row.library}): {row.ratio:.2g} times the bound" for row in lost.itertuples()]
+    title = f"Lost fits of `trajectory` (E2 more than {LOST:g} times the bound): {len(lost)} of {len(trajectory)}."
+    return "\n".join([title, *(["", *lines] if lines else []), ""])
+
+
+def page() -> str:
+    """Return the text of cross.md, made from summary.csv."""
+    table = load(HERE / "summary.csv")
     noisy, exact = table[table["noise"] > 0], table[table["noise"] == 0]
     seeds = table["ok"].str.split("/", expand=True).astype(int)
-    ended = seeds.sum()
+    succeeded, fits = seeds.sum()
     trajectory = noisy[noisy["method"] == "trajectory"]
-    lost = trajectory[trajectory["ratio"] > LOST]
+    many, slow, single = (seeds.loc[part.index, 1].max() for part in (noisy, trajectory, exact))
     kept, selected = (noisy[~noisy["own"] & (noisy["method"] == name)] for name in ("trajectory", "weak"))
     worst = exact[exact["own"]].groupby("method")["e2"].max()
     parts = [
-        "# Everything crossed with everything\n",
-        f"Made by `python results/cross/cross.py` from [summary.csv](summary.csv): {len(table.groupby(['data', 'library']))} kinds of data and libraries, "
-        f"{ended[1]} fits, {ended[0]} of which ended. `own terms`: the four terms of the lattice's own equation and its like; `large`: 10 to 13 terms. "
-        f"Seeds: {seeds.loc[noisy.index, 1].max()} with noise, {seeds.loc[trajectory.index, 1].max()} for `trajectory`, "
-        f"{seeds.loc[exact.index, 1].max()} where there is no noise.\n",
+        "# Noise, samples, sites and libraries, all crossed\n",
+        "Made by `python results/cross/cross.py` from [summary.csv](summary.csv): "
+        f"{len(table.groupby(['data', 'library']))} combinations of data and library, {fits} fits, of which "
+        f"{succeeded} succeeded. `own terms` is the library of the four terms of the lattice's own equation, "
+        f"`large` one of 10 to 13 terms. Each entry has {many} seeds ({slow} for `trajectory`) "
+        f"with noise and {single} without.\n",
         "## With noise (0.1, 1, 5, 10 %)\n",
-        markdown(methods(noisy)),
-        "\nA library with every term kept is bounded by its own, larger bound; `weak`, `stlsq` and `sr3` select, `trajectory` here does not: it keeps what "
-        f"it is given (`trajectory-select` is in [limits](../limits/which.md)). With the large libraries `weak` has the terms right in "
-        f"{100 * selected['right'].mean():.0f} % and a median error of {selected['ratio'].median():.2g} times the bound of all terms; `trajectory`, which keeps "
-        f"them, {kept['ratio'].median():.2g} times.\n",
-        "Lost fits of `trajectory` (E2 more than "
-        f"{LOST:g} times the bound): {len(lost)} of {len(trajectory)}"
-        + (": " + "; ".join(f"{row.data} ({row.library}, {row.ratio:.2g} times)" for row in lost.itertuples()) if len(lost) else "")
-        + ".\n",
-        "## Error over the bound, own terms, by what is varied (medians)\n",
-        *(f"{markdown(spread(noisy, name))}\n" for name in ("noise", "samples", "sites", "system")),
+        markdown(by_method(noisy)),
+        "\nEach library has a bound of its own, for a method that keeps all of its terms; that of a large library is "
+        "larger. `weak`, `stlsq` and `sr3` select terms; `trajectory` keeps them all (`trajectory-select` is compared "
+        "in [limits](../limits/which.md)). With the large libraries, `weak` finds the right support for "
+        f"{100 * selected['right'].mean():.0f} % of the kinds of data, and its median error is "
+        f"{selected['ratio'].median():.2g} times the bound; that of `trajectory` is {kept['ratio'].median():.2g}.\n",
+        lost_fits(trajectory),
+        "## Median E2 / bound with the own terms\n",
+        *(f"By {title}:\n\n{markdown(by_setting(noisy, name))}\n" for name, title in VARIED.items()),
         "## Without noise\n",
-        "Largest E2 with the own terms: " + ", ".join(f"`{name}` {format_number(worst[name])}" for name in METHODS) + ".",
-    ]  # fmt: skip
+        f"Largest E2 with the own terms: {', '.join(f'`{name}` {format_number(worst[name])}' for name in METHODS)}.",
+    ]
     return "\n".join(parts) + "\n"
 
 
 if __name__ == "__main__":
-    write_text(HERE / "cross.md", page(load(HERE / "summary.csv")))
+    write_text(HERE / "cross.md", page())

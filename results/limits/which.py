@@ -1,13 +1,14 @@
-"""Say which method serves when, from the published table of the suite `limits`, and write which.md.
+"""Show which method serves when, from the published table of the suite `limits`, and write which.md.
 
     latticebench run limits
     latticebench table runs/limits --only cases --only limits --only summary --only errors --out results/limits
     latticebench figures runs/limits --only error-against-noise --out results/limits
     python results/limits/which.py
 
-Every figure is computed from cases.csv beside this file. E2 is the relative error of the coefficients, the bound its smallest
-root-mean-square for an unbiased method that keeps every term (Cramer-Rao), the efficiency the bound over the root-mean-square of
-E2 over the seeds. A fit is lost when its E2 is more than LOST times the bound, or when it failed.
+Every figure is computed from cases.csv beside this file. E2 is the relative error of the coefficients; the bound is the
+smallest root-mean-square of E2 that an unbiased method can have if it keeps every term (Cramer-Rao); the efficiency is
+the bound over the root-mean-square of E2 over the seeds. A fit is lost when it failed, or when its E2 is more than LOST
+times the bound.
 """
 
 from __future__ import annotations
@@ -19,16 +20,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from latticebench.bench.publish import format_number
+from latticebench.bench.publish import render
 from latticebench.bench.tables import read_cases, summary
 from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent
 LOST = 10.0
+# A method with fewer seeds is left out of a comparison in which others have more.
 FEW = 3
-# A method serves where its median error is at most so many times the best one.
+# A method serves where its median error is at most this multiple of the smallest.
 SERVES = 1.25
-# The floor, the ceiling and the variants are no choices of their own.
+# The methods to choose from: `least-squares` and `zero` are floors, and `sr3` comes out as `stlsq` does.
 CONTESTANTS = (
     "trajectory",
     "trajectory-select",
@@ -39,18 +41,21 @@ CONTESTANTS = (
     "stlsq",
     "stlsq-differences",
 )
-FINE = ("trajectory", "splines", "weak")
+# The methods that come near the bound.
+NEAR_BOUND = ("trajectory", "splines", "weak")
+# The values of settings that a case leaves out, and the noise level at which samples and sites are varied.
 BASE = {"samples": 50, "sites": 31}
 COMPARED = 0.01
 
 
 def load(path: Path) -> pd.DataFrame:
-    """Read the cases, and add what their settings say: system, samples, sites, and whether the library is the lattice's own."""
+    """Read the cases and add columns for samples, sites, system, the lattice's own library and lost fits."""
     table = read_cases(path)
     settings = [json.loads(text) for text in table["identity"]]
     for name, value in BASE.items():
         table[name] = [one.get(name, value) for one in settings]
     table["system"] = [one["system"] for one in settings]
+    # Samples and sites are varied with the lattice's own library alone.
     own = table.loc[table["part"] == "samples", ["system", "library"]].drop_duplicates()
     table["own"] = pd.MultiIndex.from_frame(table[["system", "library"]]).isin(pd.MultiIndex.from_frame(own))
     ended = table["status"] == "ok"
@@ -62,9 +67,9 @@ def load(path: Path) -> pd.DataFrame:
 
 
 def fair(table: pd.DataFrame) -> pd.DataFrame:
-    """Keep the contestants, and for each kind of data the seeds that all of them have: the same samples for everyone.
+    """Keep the contestants, and per kind of data the seeds that all of them have: the same samples for everyone.
 
-    A contestant of fewer than FEW seeds is left out where others have more.
+    A contestant with fewer than FEW seeds is left out where others have more.
     """
     kept = []
     for _, group in table[table["method"].isin(CONTESTANTS)].groupby(["data", "library"], sort=False):
@@ -75,23 +80,47 @@ def fair(table: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(kept)
 
 
-def shown(table: pd.DataFrame) -> str:
-    """Write a table as Markdown, numbers with two digits."""
-    readable = table.reset_index()
-    readable.columns = [str(name) for name in readable.columns]
-    for name in readable.columns:
-        if pd.api.types.is_float_dtype(readable[name]):
-            readable[name] = [format_number(value) for value in readable[name]]
-    return str(readable.astype(str).to_markdown(index=False, disable_numparse=True)) + "\n"
+# Tables and numbers as text -----------------------------------------------------------------------------------------
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """Return a table and its index as Markdown, numbers with two digits."""
+    return render(table.rename(columns=str).reset_index(), {}, "md").rstrip() + "\n"
 
 
 def percent(values: pd.Series) -> pd.Series:
-    """Write shares as percentages."""
+    """Return shares as percentages."""
     return values.map(lambda value: f"{100 * value:g} %")
 
 
+def span(values: pd.Series) -> str:
+    """Return the smallest and the largest of some numbers, each with two digits."""
+    low, high = (f"{float(f'{value:.2g}'):g}" for value in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"
+
+
+def counted(names: pd.Series) -> str:
+    """Return each name with the number of times it occurs, the most frequent first."""
+    return ", ".join(f"`{name}` {count}" for name, count in names.value_counts().items())
+
+
+def lost_fits(table: pd.DataFrame, methods: Sequence[str]) -> str:
+    """Count the lost fits of each method by system and noise level."""
+    found = []
+    for method in methods:
+        mine = table[table["method"] == method]
+        lost = mine[mine["lost"]]
+        cells = lost.assign(cell=lost["system"] + ", " + percent(lost["noise"])).groupby("cell", sort=False)
+        places = "; ".join(f"{cell}: {len(group)}" for cell, group in cells)
+        found.append(f"`{method}` " + (f"{len(lost)} of {len(mine)} ({places})" if places else f"none of {len(mine)}"))
+    return "; ".join(found)
+
+
+# Comparisons --------------------------------------------------------------------------------------------------------
+
+
 def arranged(table: pd.DataFrame, rows: Sequence[str], value: str, *, bound: bool = False) -> pd.DataFrame:
-    """Arrange the medians of a score as rows against methods; `efficiency` is no median but one figure a cell."""
+    """Arrange the medians of a score as rows against methods; of `efficiency` each entry has a single value."""
     methods = [name for name in CONTESTANTS if name in set(table["method"])]
     if value == "efficiency":
         pairs = [*rows, "method"]
@@ -115,14 +144,8 @@ def arranged(table: pd.DataFrame, rows: Sequence[str], value: str, *, bound: boo
     return wide
 
 
-def span(values: pd.Series) -> str:
-    """Write the smallest and the largest of some numbers, each with two digits."""
-    low, high = (f"{float(f'{value:.2g}'):g}" for value in (values.min(), values.max()))
-    return low if low == high else f"{low} to {high}"
-
-
 def scatter(table: pd.DataFrame, method: str) -> float:
-    """Say by how much an efficiency over these seeds scatters, as a share: a bootstrap over the seeds, median over the cells."""
+    """Return the relative standard error of an efficiency, from a bootstrap over the seeds; median over the entries."""
     draw = np.random.default_rng(0)
     found = []
     for _, group in table[(table["method"] == method) & ~table["lost"]].groupby(["data", "library"]):
@@ -133,19 +156,8 @@ def scatter(table: pd.DataFrame, method: str) -> float:
     return float(np.median(found))
 
 
-def lost(table: pd.DataFrame, method: str) -> str:
-    """Count the lost fits of a method, and say where they are."""
-    mine = table[table["method"] == method]
-    gone = mine[mine["lost"]]
-    if gone.empty:
-        return f"none of {len(mine)}"
-    cells = gone.assign(cell=gone["system"] + ", " + percent(gone["noise"])).groupby("cell", sort=False)
-    places = [f"{cell}: {len(group)}" for cell, group in cells]
-    return f"{len(gone)} of {len(mine)} ({'; '.join(places)})"
-
-
-def picks(table: pd.DataFrame) -> pd.DataFrame:
-    """Find for each kind of data and library the best median error, and the quickest method that serves."""
+def winners(table: pd.DataFrame) -> pd.DataFrame:
+    """Find the method with the smallest median error and the fastest that serves, per kind of data and library."""
     rows = []
     for (data, library), group in fair(table).groupby(["data", "library"], sort=False):
         short = group.groupby("method", sort=False).agg(e2=("e2", "median"), seconds=("cpu_seconds", "median"))
@@ -154,45 +166,43 @@ def picks(table: pd.DataFrame) -> pd.DataFrame:
         rows.append(
             {
                 "part": first["part"], "own": first["own"], "data": data, "library": library,
-                "best": short["e2"].idxmin(), "quickest": serving["seconds"].idxmin(),
+                "best": short["e2"].idxmin(), "fastest": serving["seconds"].idxmin(),
             }
         )  # fmt: skip
     return pd.DataFrame(rows)
 
 
-def counted(names: pd.Series) -> str:
-    """Write how often each name occurs, the most frequent first."""
-    return ", ".join(f"`{name}` {count}" for name, count in names.value_counts().items())
+def error_ratio(table: pd.DataFrame, method: str, other: str) -> pd.Series:
+    """Divide a method's median error on each kind of data by that of another, over the seeds that both have."""
+    errors = [
+        table[table["method"] == name].set_index(["data", "library", "seed"])["e2"].rename(name)
+        for name in (method, other)
+    ]
+    medians = pd.concat(errors, axis=1, join="inner").groupby(level=["data", "library"], sort=False).median()
+    return medians[method] / medians[other]
 
 
-def times(table: pd.DataFrame, method: str, other: str) -> pd.Series:
-    """Divide a method's median error on each kind of data by another's, or by the bound, on the seeds that both have."""
-    mine = table[table["method"] == method].set_index(["data", "library", "seed"])
-    theirs = mine["bound"] if other == "bound" else table[table["method"] == other].set_index(mine.index.names)["e2"]
-    both = pd.concat([mine["e2"], theirs.rename("other")], axis=1, join="inner")
-    medians = both.groupby(level=["data", "library"], sort=False).median()
-    return medians["e2"] / medians["other"]
+# The sections of the page -------------------------------------------------------------------------------------------
 
 
 def own_terms(table: pd.DataFrame) -> str:
-    """Tell of the lattices' own terms, with noise."""
+    """Write the section on the lattices' own terms, with noise."""
     noisy = table[(table["part"] == "noise") & table["own"] & (table["noise"] > 0)]
-    efficiency = arranged(noisy, ["system", "noise"], "efficiency")
-    lost_ones = "; ".join(f"`{name}` {lost(noisy, name)}" for name in (*FINE, "pinn-vp"))
+    scattered = 100 * scatter(noisy, "trajectory")
     return "\n".join(
         [
-            "## The terms are known\n",
-            "Efficiency with the lattice's own terms, 50 samples of 31 sites; 1 is the best that anyone can do. Ten seeds (three for "
-            f"`pinn-vp`), over which an efficiency scatters by about {100 * scatter(noisy, 'trajectory'):.0f} %; since the noise of a seed is "
-            "the same at every level but for its size, the levels do not average that out.\n",
-            shown(efficiency),
-            f"Lost fits (E2 above {LOST:g} times the bound): {lost_ones}.\n",
+            "## The lattice's own terms\n",
+            "Efficiency with 50 samples of 31 sites; 1 is the best that an unbiased method can reach. Over ten seeds "
+            f"(three for `pinn-vp`) an efficiency scatters by about {scattered:.0f} %. A seed draws the same noise at "
+            "every level, only scaled, so averaging over the levels does not reduce this scatter.\n",
+            markdown(arranged(noisy, ["system", "noise"], "efficiency")),
+            f"Lost fits (E2 above {LOST:g} times the bound): {lost_fits(noisy, (*NEAR_BOUND, 'pinn-vp'))}.\n",
         ]
     )
 
 
 def large_libraries(table: pd.DataFrame) -> str:
-    """Tell of the large libraries, with noise."""
+    """Write the section on the large libraries, with noise."""
     noisy = table[(table["part"] == "noise") & ~table["own"] & (table["noise"] > 0)]
     right = noisy.assign(right=(noisy["tpr"] == 1).astype(float))
     support = right[right["method"].isin(CONTESTANTS)].pivot_table(
@@ -203,129 +213,148 @@ def large_libraries(table: pd.DataFrame) -> str:
     support.columns.name = None
     return "\n".join(
         [
-            "## Only a long list of terms is known\n",
-            "Median E2. The bound is that of a method which keeps all terms; one that drops the right ones can do better. It is a "
-            "root-mean-square, and where one direction dominates, a median over few seeds scatters widely below it.\n",
-            shown(arranged(fair(noisy), ["system", "library", "noise"], "e2", bound=True)),
-            "Share of fits with the right support (a term counts as found when it is at least 5 % of the derivative):\n",
-            shown(support.round(2)),
-            "Lost fits: " + "; ".join(f"`{name}` {lost(noisy, name)}" for name in (*FINE, "trajectory-select")) + ".\n",
+            "## Large libraries\n",
+            "Median E2. The bound is for a method that keeps all terms; one that drops absent terms can do better. It "
+            "bounds a root-mean-square: where one combination of coefficients dominates the error, the median over a "
+            "few seeds can be far smaller.\n",
+            markdown(arranged(fair(noisy), ["system", "library", "noise"], "e2", bound=True)),
+            "Share of fits with the right support (a term counts as found if it is at least 5 % of the derivative):\n",
+            markdown(support.round(2)),
+            f"Lost fits: {lost_fits(noisy, (*NEAR_BOUND, 'trajectory-select'))}.\n",
         ]
     )
 
 
 def more_of(table: pd.DataFrame, axis: str) -> str:
-    """Tell of more samples or sites: the arm of the star, with its middle from the noise axis."""
+    """Write the section on more samples or more sites; the values in the middle are those of the part `noise`."""
     middle = (table["part"] == "noise") & table["own"] & (table["noise"] == COMPARED)
     arm = table[middle | (table["part"] == axis)].sort_values(["system", axis], kind="stable")
     arm = arm[arm["method"] != "pinn-vp"]
     wide = arranged(fair(arm), ["system", axis], "e2", bound=True)
-    ends = sorted(arm[axis].unique())
-    change = {
-        name: wide[name].xs(ends[0], level=axis) / wide[name].xs(ends[-1], level=axis)
-        for name in ("trajectory", "weak", "stlsq")
-    }  # fmt: skip
+    least, most = min(arm[axis]), max(arm[axis])
+    falls = {
+        name: span(wide[name].xs(least, level=axis) / wide[name].xs(most, level=axis))
+        for name in ("bound", "trajectory", "weak", "stlsq")
+    }
     seconds = arm.pivot_table(index=axis, columns="method", values="cpu_seconds", aggfunc="median")
     seconds = seconds.reindex(columns=[name for name in CONTESTANTS if name in seconds and name in wide])
     seconds.columns.name = None
+    fixed = ", ".join(f"{value} {name}" for name, value in BASE.items() if name != axis)
     return "\n".join(
         [
             f"## More {axis}\n",
-            f"Median E2 at 1 % noise, own terms, everything else as before.\n\n{shown(wide)}",
-            f"From {ends[0]} to {ends[-1]} {axis} the bound falls by a factor of "
-            f"{span(wide['bound'].xs(ends[0], level=axis) / wide['bound'].xs(ends[-1], level=axis))}; the median error of "
-            + ", ".join(f"`{name}` by {span(values)}" for name, values in change.items())
-            + ".\n",
-            f"Processor seconds a fit (median over the systems):\n\n{shown(seconds)}",
+            f"Median E2 with the lattice's own terms, 1 % noise, {fixed}.\n\n{markdown(wide)}",
+            f"From {least} to {most} {axis} the bound falls by a factor of {falls.pop('bound')}, depending on the "
+            f"lattice, and the median error of {', '.join(f'`{name}` by {fall}' for name, fall in falls.items())}.\n",
+            f"Median processor seconds per fit:\n\n{markdown(seconds)}",
         ]
     )
 
 
 def without_noise(table: pd.DataFrame) -> str:
-    """Tell of noise-free samples."""
+    """Write the section on noise-free samples."""
     clean = table[(table["part"] == "noise") & (table["noise"] == 0)]
-    return "\n".join(
-        ["## No noise\n", "E2 of one fit each.\n", shown(arranged(clean, ["system", "library"], "e2"))]
-    )  # fmt: skip
+    errors = arranged(clean, ["system", "library"], "e2")
+    return f"## No noise\n\nE2 of a single fit per entry.\n\n{markdown(errors)}"
 
 
 def forecasts(table: pd.DataFrame) -> str:
-    """Tell how far the found equations foretell."""
+    """Write the section on forecasts with the equations found."""
     chosen = table[(table["part"] == "noise") & table["own"] & (table["noise"] == COMPARED)]
-    wide = arranged(fair(chosen), ["system"], "forecast_error")
+    return (
+        "## Forecasts\n\nMedian relative error of a forecast from an initial state that no method saw, with the "
+        f"lattice's own terms and 1 % noise.\n\n{markdown(arranged(fair(chosen), ['system'], 'forecast_error'))}"
+    )
+
+
+def advice(own: pd.DataFrame, large: pd.DataFrame) -> list[str]:
+    """Write the advice; which method it names follows from the figures, by the rule stated beside them."""
+    seconds = own.groupby("method")["cpu_seconds"].median()
+    efficiency = arranged(own, ["system", "noise"], "efficiency")
+    lowest = efficiency[list(NEAR_BOUND)].min().round(2)
+    first = min(NEAR_BOUND, key=lambda name: (-lowest[name], seconds[name]))
+    others = ", ".join(f"`{name}` {lowest[name]:.2g}" for name in NEAR_BOUND if name != first)
+    quick = min(NEAR_BOUND, key=lambda name: seconds[name])
+    errors = {
+        name: float(error_ratio(large, name, "trajectory").median()) for name in ("trajectory-select", "weak", "stlsq")
+    }
+    chooser = min(errors, key=lambda name: errors[name])
+    slower = large.groupby("method")["cpu_seconds"].median()
+    bounds = large.groupby("data")["bound"].mean() / own.groupby("data")["bound"].mean()
+    return [
+        f"- **If the terms are known**: `{first}`. Its lowest efficiency over four lattices and four noise levels, "
+        f"{lowest[first]:.2g}, is the highest ({others}; the faster method wins a tie). A fit takes "
+        f"{seconds[first]:.2g} s.",
+        f"- **If there are many fits to do**: `{quick}`. A fit takes {seconds[quick]:.2g} s, and its error is "
+        f"{span(error_ratio(own, quick, first))} times that of `{first}`.",
+        f"- **If only a large library is known**: `{chooser}`. A fit takes {slower[chooser]:.2g} s, and its "
+        f"error is {span(error_ratio(large, chooser, 'trajectory'))} times that of `trajectory`, which keeps all "
+        f"terms. The error of `weak` is {span(error_ratio(large, 'weak', 'trajectory'))} times "
+        f"that of `trajectory`, at {slower['weak']:.2g} s per fit.",
+        f"- **The network** (`pinn-vp`) has {span(error_ratio(own, 'pinn-vp', first))} times the error of `{first}` "
+        f"and takes {seconds['pinn-vp'] / seconds[first]:.0f} times as long.",
+        f"- **Regression on derivatives** (`stlsq`) is fast, at {seconds['stlsq']:.2g} s per fit. With noise "
+        f"its error is {span(error_ratio(own, 'stlsq', first))} times that of `{first}`; with pysindy's finite "
+        f"differences, {span(error_ratio(own, 'stlsq-differences', first))} times. `sindy-tuned`, which chooses "
+        f"optimiser, differentiation and settings from the samples, takes {seconds['sindy-tuned']:.2g} s per fit; its "
+        f"error is {span(error_ratio(own, 'sindy-tuned', first))} times that of `{first}` and, with large libraries, "
+        f"{span(error_ratio(large, 'sindy-tuned', chooser))} times that of `{chooser}`.",
+        "- **A large library costs accuracy as well as time**: with every term kept, its bound is "
+        f"{span(bounds)} times that of the lattice's own terms.",
+    ]
+
+
+def in_short(table: pd.DataFrame) -> str:
+    """Write the section with the advice and the counts behind it."""
+    noisy = table[table["noise"] > 0]
+    base = noisy[noisy["part"] == "noise"]
+    found = winners(noisy)
+    groups = {
+        "own terms, noise": found[found["own"] & (found["part"] == "noise")],
+        "large libraries, noise": found[~found["own"]],
+        "own terms, samples and sites": found[found["part"] != "noise"],
+    }
     return "\n".join(
         [
-            "## Forecasts\n",
-            "Median relative error of a simulation from an initial state that no method saw, own terms, 1 % noise.\n",
-            shown(wide),
+            "## In short\n",
+            *advice(base[base["own"]], base[~base["own"]]),
+            "\nNumber of kinds of data, with noise, on which each method has the smallest median error, and on which "
+            f"it is the fastest of those with a median error of at most {SERVES:g} times the smallest:\n",
+            f"| | kinds of data | smallest error | fastest within {SERVES:g} times |",
+            "|---|---|---|---|",
+            *(
+                f"| {name} | {len(group)} | {counted(group['best'])} | {counted(group['fastest'])} |"
+                for name, group in groups.items()
+            ),
+            "",
         ]
     )
 
 
-def in_short(table: pd.DataFrame) -> str:
-    """Give the advice: which method is meant follows from the figures by the rule that is told beside it."""
-    noisy = table[table["noise"] > 0]
-    own = noisy[(noisy["part"] == "noise") & noisy["own"]]
-    large = noisy[(noisy["part"] == "noise") & ~noisy["own"]]
-    seconds = own.groupby("method")["cpu_seconds"].median()
-    efficiency = arranged(own, ["system", "noise"], "efficiency")
-    worst = efficiency[list(FINE)].min().round(2)
-    # The least efficiency decides, and between equals the time.
-    first = min(FINE, key=lambda name: (-worst[name], seconds[name]))
-    quick = min(FINE, key=lambda name: seconds[name])
-    network = times(own, "pinn-vp", first)
-    errors = {name: float(times(large, name, "trajectory").median()) for name in ("trajectory-select", "weak", "stlsq")}
-    chooser = min(errors, key=lambda name: errors[name])
-    slower = large.groupby("method")["cpu_seconds"].median()
-    lines = [
-        "## In short\n",
-        f"- **The terms are known**: `{first}`, whose least efficiency over four lattices and four noise levels is the highest "
-        f"({worst[first]:.2g}; "
-        + ", ".join(f"`{name}` {worst[name]:.2g}" for name in FINE if name != first)
-        + f"; equals are told apart by their time), in {seconds[first]:.2g} s.",
-        f"- **There are many fits to do**: `{quick}` takes {seconds[quick]:.2g} s, and its error is {span(times(own, quick, first))} times that of "
-        f"`{first}`.",
-        f"- **Only a long list of terms is known**: `{chooser}`, whose error is {span(times(large, chooser, 'trajectory'))} times that of the same "
-        f"fit with all terms kept, in {slower[chooser]:.2g} s; `weak` {span(times(large, 'weak', 'trajectory'))} times, in {slower['weak']:.2g} s.",
-        f"- **The network** (`pinn-vp`): {span(network)} times the error of `{first}` in {seconds['pinn-vp'] / seconds[first]:.0f} times its time.",
-        f"- **Regression on derivatives** (`stlsq`), with noise: {span(times(own, 'stlsq', first))} times the error of `{first}`; with "
-        f"pysindy's finite differences {span(times(own, 'stlsq-differences', first))} times. It is the quickest, {seconds['stlsq']:.2g} s. "
-        f"With optimiser, differentiation and settings chosen by the samples (`sindy-tuned`, {seconds['sindy-tuned']:.2g} s): "
-        f"{span(times(own, 'sindy-tuned', first))} times; of long lists {span(times(large, 'sindy-tuned', chooser))} times that of `{chooser}`.",
-        "- **The long list costs knowledge, not only time**: with every term kept, the bound is "
-        f"{span(large.groupby('data')['bound'].mean() / own.groupby('data')['bound'].mean())} times that of the lattice's own terms.",
-        "",
-        f"Counted over the kinds of data with noise, a method serving where its median error is at most {SERVES:g} times the best:\n",
-    ]
-    found = picks(noisy)
-    rows = []
-    for name, group in (
-        ("own terms, noise", found[found["own"] & (found["part"] == "noise")]),
-        ("large libraries, noise", found[~found["own"]]),
-        ("own terms, samples and sites", found[found["part"] != "noise"]),
-    ):
-        rows.append(f"| {name} | {len(group)} | {counted(group['best'])} | {counted(group['quickest'])} |")
-    lines += ["| | kinds of data | best | quickest that serves |", "|---|---|---|---|", *rows, ""]
-    return "\n".join(lines)
-
-
-def main() -> None:
-    """Write which.md beside this file."""
-    path = HERE / "cases.csv"
+def page() -> str:
+    """Return the text of which.md, made from cases.csv."""
     table = load(HERE)
-    made = [line.removeprefix("# ") for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("# ")]
-    # The head's lines about the run; the machine's and the versions' stand in the tables.
+    head = (HERE / "cases.csv").read_text(encoding="utf-8").splitlines()
+    made = [line.removeprefix("# ") for line in head if line.startswith("# ")]
+    # Settings and versions are at the head of the tables.
     made = [line for line in made if line.split(":")[0] in ("command", "commit", "date", "machine", "seeds")]
     parts = [
         "# Which method when\n",
-        "Made by `python results/limits/which.py` from [cases.csv](cases.csv), a run of the suite `limits`: four lattices from known ends, "
-        "noise, samples and sites varied one after the other about 50 samples of 31 sites at 1 % noise. What may be known of each "
-        "coefficient stands in [limits.md](limits.md), the figure in [error-against-noise.png](error-against-noise.png).\n",
-        in_short(table), own_terms(table), large_libraries(table), more_of(table, "samples"), more_of(table, "sites"),
-        without_noise(table), forecasts(table), "".join(f"- {line}\n" for line in made),
-    ]  # fmt: skip
-    write_text(HERE / "which.md", "\n".join(parts))
+        "Made by `python results/limits/which.py` from [cases.csv](cases.csv), a run of the suite `limits`: four "
+        "lattices with known ends; noise, samples and sites are varied one at a time about 50 samples of 31 sites at "
+        "1 % noise. The bound of each coefficient is in [limits.md](limits.md); "
+        "[error-against-noise.png](error-against-noise.png) shows the errors.\n",
+        in_short(table),
+        own_terms(table),
+        large_libraries(table),
+        more_of(table, "samples"),
+        more_of(table, "sites"),
+        without_noise(table),
+        forecasts(table),
+        "".join(f"- {line}\n" for line in made),
+    ]
+    return "\n".join(parts)
 
 
 if __name__ == "__main__":
-    main()
+    write_text(HERE / "which.md", page())
