@@ -1,25 +1,32 @@
-"""Say which method's residual gives the best diagnosis, and write residuals.md and residuals.csv.
+"""Measure which method's residual gives the best diagnosis, and write residuals.csv and residuals.md.
 
     python results/loop/residuals.py
-    python results/loop/residuals.py --page    # scores and page again, from the trials in residuals.csv
+    python results/loop/residuals.py --page    # the page again, from residuals.csv
 
-A specimen is a recording with one force that the declared equation lacks. Each method fits the declared equation; what it leaves, r, is
-regressed on what each effect of the catalogue would add. Forces s(n, t) along the method's own state become columns R s by a linear
-map R of the method's own:
+A trial is a simulated recording with one force that the declared equation lacks. Each method fits the declared
+equation, and its residual r is regressed on what each effect of the catalogue would add to it. A force s(n, t) along
+the method's own state becomes a column R s, where the linear map R depends on the method:
 
-    trajectory   r: what the shooting fit leaves of the readings, over the noise; R: what a force does to the readings (`diagnosis.tangent`)
-    weak         r: the weak equations' residual; R: integrals over the test functions; both whitened by the covariance of the
-                 weak equations
-    splines,     r = d^order u/dt^order - F(u, v; xi) along the method's curves, and R = 1; means of both over stretches of time,
-    pinn-vp      so long that the means count as independent
+    trajectory   r: the readings less the shooting fit, in units of the noise;
+                 R: the response of the readings to a force (`diagnosis.tangent`)
+    weak         r: the residual of the weak equations; R: integrals over the test functions;
+                 both whitened with the covariance of the weak equations
+    splines,     r = d^order u/dt^order - F(u, v; xi) along the method's curves; R = 1;
+    pinn-vp      both averaged over stretches of time so long that the means count as independent
 
-The stretches are one correlation time of r long, dt (1 + 2 sum of the autocorrelation up to its first zero), pooled over the sites; the first
-and the last are left out, since derivatives are worst at the ends. Correlations between sites are not seen to.
+A stretch is one correlation time of r, dt (1 + 2 sum of the autocorrelation up to its first zero), pooled over the
+sites. The first and the last stretch are left out, since derivatives are least accurate at the ends. Correlations
+between sites are ignored.
 
-Everything else is the same for all (`diagnosis.trace`): the ways in which an effect may be there; the columns of the declared terms are
-projected out; with U an orthonormal basis of a way's columns and nu the rows less the declared terms (and, for the trajectory,
-the start), the gain is -nu ln(1 - |U^T r|^2 / |r|^2), twice the log likelihood ratio with the noise's size fitted; the evidence is -ln of the
-tail of chi squared at the gain, less the cost of the search, and ranks the effects.
+Everything else is the same for all methods (`diagnosis.trace`): the ways in which an effect may act, and the
+projection that removes the columns of the declared terms. With U an orthonormal basis of the columns of a way of
+acting, and nu the number of rows less that of the declared terms (and, for the trajectory, of the initial state), the
+gain is
+
+    -nu ln(1 - |U^T r|^2 / |r|^2),
+
+twice the log likelihood ratio with the size of the noise fitted. Effects are ranked by their evidence: -ln of the upper
+tail probability of chi squared at the gain, less the cost of the search.
 """
 
 from __future__ import annotations
@@ -38,13 +45,14 @@ from numpy import ndarray
 from scipy.stats import binomtest
 
 from latticebench import methods, systems
-from latticebench.bench.provenance import origin
-from latticebench.bench.publish import format_number
+from latticebench.bench.provenance import lines, origin
+from latticebench.bench.publish import format_number, render
 from latticebench.bench.trials import faults, specimen
 from latticebench.bench.trials.trial import OFF_SIZE
 from latticebench.diagnosis import trace
 from latticebench.diagnosis.model import Fitted, Model, first_fit
 from latticebench.diagnosis.tangent import Path, Tangent, forces, linearise, orthonormal
+from latticebench.diagnosis.ways import ways
 from latticebench.methods.method import Smooth, solve
 from latticebench.methods.trajectory import Solution, State
 from latticebench.methods.weak import ACCURACY, Weak, WeakForm, estimate, linearised
@@ -59,12 +67,12 @@ SYSTEMS = ("phi4", "sine-gordon", "dnls", "ginzburg-landau")
 SIZES = (10.0, 30.0)
 SEEDS = (1,)
 CANDIDATES = tuple(effect for effect in CATALOGUE if effect.acts not in INSTRUMENT)
-# So near the best one in evidence an effect counts as not told from it.
+# Two effects whose evidence differs by less than EQUAL nats are not told apart; by less than TIE, they are the same.
 EQUAL = 3.0
 TIE = 1e-6
 SURROGATES = 100
 NOISE = 0.01
-# The slowest method is given every third specimen.
+# The slowest method is given every third trial.
 SLOW = "pinn-vp"
 LEAST_STRETCHES = 6
 SCORES = {"first": "ranked first", "two": "within the first two", "near": f"within {EQUAL:g} nats of the first"}
@@ -72,7 +80,7 @@ SCORES = {"first": "ranked first", "two": "within the first two", "near": f"with
 
 @dataclass(frozen=True, eq=False)
 class Along(Path):
-    """A method's own state, with the method's own way from forces to rows.
+    """The state that a method estimated, with the method's own map from forces to rows of its residual.
 
     Attributes:
         project: from forces (columns, F, parts, N) to rows (rows, columns).
@@ -81,7 +89,7 @@ class Along(Path):
     project: Callable[[ndarray], ndarray]
 
     def answer(self, source: ndarray) -> ndarray:
-        """Give what forces add to the residual, one column each."""
+        """Return what forces add to the residual, one column per force."""
         return self.project(source)
 
 
@@ -95,17 +103,17 @@ def along(
     residual: ndarray | None = None,
     rate: ndarray | None = None,
 ) -> Tangent:
-    """Write a method's residual as a tangent, so that it can be traced as the trajectory's is.
+    """Return a method's residual as a tangent, so that it can be traced as that of a trajectory is.
 
     Args:
         model: the declared equation.
         samples: what was fitted.
-        times: of the state (F,).
+        times: times of the state (F,).
         field: u and, for order 2, v (F, order, parts, N).
-        coefficients: xi.
+        coefficients: xi of the declared terms.
         project: see `Along`.
-        residual: of the rows (rows,); None: what the equation leaves of `rate`, projected.
-        rate: the highest derivative (F, parts, N).
+        residual: the rows (rows,); if None, `rate` less the declared terms, projected.
+        rate: the highest derivative (F, parts, N); needed if `residual` is None.
     """
     (record,) = model.records([samples])
     none = np.zeros((0, 0, 0))
@@ -126,12 +134,12 @@ def along(
 
 
 def by_trajectory(model: Model, samples: Samples) -> Tangent:
-    """Take what the shooting fit leaves of the readings."""
+    """Trace the readings less the shooting fit."""
     return linearise(first_fit(model, [samples]))
 
 
 def by_weak(model: Model, samples: Samples) -> Tangent:
-    """Take the whitened residual of the weak equations; no declared term is dropped."""
+    """Trace the whitened residual of the weak equations; no declared term is dropped."""
     default = Weak()
     form = WeakForm(samples, model.declared, model.order, default.half_width, default.power)
     found = estimate([form], np.ones(len(model.declared.terms), dtype=bool), default.rounds)
@@ -149,7 +157,7 @@ def by_weak(model: Model, samples: Samples) -> Tangent:
 
 
 def by_curves(name: str) -> Callable[[Model, Samples], Tangent]:
-    """Take what the equation leaves of the derivative along a method's curves."""
+    """Trace the derivative less the declared terms along a method's curves."""
 
     def make(model: Model, samples: Samples) -> Tangent:
         fit = solve(methods.find(name)(), [samples], model.declared, model.order, 1)
@@ -165,7 +173,7 @@ def by_curves(name: str) -> Callable[[Model, Samples], Tangent]:
 
 
 def stretches(residual: ndarray, curves: Smooth) -> Callable[[ndarray], ndarray]:
-    """Give the means over stretches of one correlation time of a residual (Q, parts, N)."""
+    """Return the map to means over stretches of time, each one correlation time of a residual (Q, parts, N) long."""
     series = residual.reshape(len(residual), -1)
     inner = series - series.mean(axis=0)
     products = [float(np.sum(inner[k:] * inner[: len(inner) - k])) for k in range(len(inner) // 2)]
@@ -185,20 +193,18 @@ METHODS: dict[str, Callable[[Model, Samples], Tangent]] = {
 
 def findings(tangent: Tangent) -> list[trace.Finding]:
     """Rank the effects of the catalogue that are forces by their evidence, the best first."""
-    # The name it had before.
-    ways = getattr(trace, "ways", None) or trace._tries
     groups = [(effect.name, True, ways(tangent, effect)) for effect in CANDIDATES]
     return trace.rank(tangent, [one for one in groups if one[2]], np.random.default_rng(1), SURROGATES)
 
 
 def effects(system: System) -> list[str]:
-    """Name the effects of the catalogue that are forces which the declared equation lacks."""
+    """Return the names of the effects that are forces and that a system's equation lacks."""
     known = [name for name in faults.PUSHES if name not in faults.OTHERS]
     return [name for name in known if find(name) in CANDIDATES and faults.sensible(name, system)]
 
 
-def trial(name: str, system: System, effect: str, z: float, seed: int, samples: Samples) -> dict[str, object]:
-    """Fit, trace, and say where the right effect is ranked; a fit that fails ranks nothing."""
+def diagnose(name: str, system: System, effect: str, z: float, seed: int, samples: Samples) -> dict[str, object]:
+    """Fit and trace one trial by one method, and return its row; where the fit fails, nothing is ranked."""
     row: dict[str, object] = {
         "method": name, "system": system.name, "effect": effect, "z": z, "seed": seed, "status": "ok", "best": "",
         "rank": np.nan, "behind": np.inf, "gain": np.nan, "rows": 0,
@@ -218,8 +224,8 @@ def trial(name: str, system: System, effect: str, z: float, seed: int, samples: 
     return row | {"best": names[0], "seconds": time.process_time() - began}
 
 
-def trials() -> pd.DataFrame:
-    """Run every trial; one row for each specimen and method."""
+def run() -> pd.DataFrame:
+    """Run all trials; one row per trial and method."""
     rows = []
     number = 0
     for system in map(systems.find, SYSTEMS):
@@ -233,14 +239,14 @@ def trials() -> pd.DataFrame:
                 continue
             samples = replace(one.samples.observed(), ends=system.ends)
             chosen = [name for name in METHODS if name != SLOW or number % 3 == 0]
-            rows += [{**trial(name, system, effect, z, seed, samples), "size": one.z} for name in chosen]
+            rows += [{**diagnose(name, system, effect, z, seed, samples), "size": one.z} for name in chosen]
             number += 1
             print(f"{number}: {system.name}, {effect}, z = {z:g}", flush=True)
     return pd.DataFrame(rows)
 
 
 def scored(table: pd.DataFrame) -> pd.DataFrame:
-    """Add the scores; effects that are the same beside the declared terms are first together."""
+    """Add the scores; effects that are the same beside the declared terms share the first rank."""
     table["first"] = table["behind"] <= TIE
     table["two"] = table["first"] | (table["rank"] <= 2)
     table["near"] = table["behind"] <= EQUAL
@@ -248,162 +254,179 @@ def scored(table: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-# The page -------------------------------------------------------------------------------------------------------------------------
+# The page -----------------------------------------------------------------------------------------------------------
 
 KEYS = ["system", "effect", "z", "seed"]
 
 
 def percent(share: float) -> str:
-    """Write a share as a percentage."""
+    """Return a share as a percentage."""
     return "" if np.isnan(share) else f"{100 * share:.0f} %"
 
 
-def markdown(table: pd.DataFrame) -> str:
-    """Write a table of texts as Markdown."""
-    return str(table.astype(str).to_markdown(index=False, disable_numparse=True)) + "\n"
+def each(values: pd.Series, text: Callable[[float], str] = format_number) -> str:
+    """Return one number per method as text."""
+    return ", ".join(f"`{name}` {text(value)}" for name, value in values.items())
+
+
+def markdown(rows: Sequence[dict[str, object]]) -> str:
+    """Return rows as a Markdown table."""
+    return render(pd.DataFrame(rows).astype(str), {}, "md").rstrip() + "\n"
 
 
 def scores(table: pd.DataFrame) -> str:
-    """Write each method's scores on some trials."""
+    """Return a table of each method's scores on some trials."""
     rows = []
     for name in METHODS:
         mine = table[table["method"] == name]
         if mine.empty:
             continue
-        row: dict[str, object] = {"method": f"`{name}`", "specimens": len(mine)}
+        row: dict[str, object] = {"method": f"`{name}`", "trials": len(mine)}
         row |= {title: percent(float(mine[score].mean())) for score, title in SCORES.items()}
         row |= {f"first, z = {z:g}": percent(float(mine.loc[mine["z"] == z, "first"].mean())) for z in SIZES}
         row |= {"gain / z^2": format_number(float(mine["share"].median())), "rows": f"{mine['rows'].median():.0f}"}
         row |= {"failed": int((mine["status"] != "ok").sum())}
         rows.append(row | {"seconds": format_number(float(mine["seconds"].median()))})
-    return markdown(pd.DataFrame(rows))
+    return markdown(rows)
 
 
 def firsts(table: pd.DataFrame, by: Sequence[str]) -> str:
-    """Write how often the right effect is ranked first, out of how many, for each method."""
+    """Return a table of how often each method ranks the right effect first, grouped by columns."""
     rows = []
     for keys, group in table.groupby(list(by), sort=False):
-        row: dict[str, object] = dict(zip(by, keys, strict=True))
+        row: dict[str, object] = {name: f"{key:g}" if name == "z" else key for name, key in zip(by, keys, strict=True)}
         for name in METHODS:
             mine = group.loc[group["method"] == name, "first"]
             row[name] = f"{int(mine.sum())} of {len(mine)}" if len(mine) else ""
         rows.append(row)
-    return markdown(pd.DataFrame(rows).replace({"z": {z: f"{z:g}" for z in SIZES}}))
+    return markdown(rows)
 
 
 def common(table: pd.DataFrame) -> pd.DataFrame:
-    """Keep the specimens that every method was given."""
+    """Keep the trials that every method was given."""
     return table[table.groupby(KEYS)["method"].transform("nunique") == len(METHODS)]
 
 
 def split(table: pd.DataFrame, one: str, other: str) -> tuple[int, int, int, int, float]:
-    """Count the specimens given to both of two methods: both right, only one, only the other, neither; and the sign test's chance.
+    """Compare two methods on the trials that both were given, by a sign test.
 
-    Specimens of one effect on one lattice share what was drawn for them, so the test counts each such effect once, for the method that
-    is right on more of its specimens.
+    Trials of one effect on one lattice share what was drawn for them, so the test counts each such effect once, for the
+    method that is right on more of its trials.
+
+    Returns:
+        The number of trials on which both methods, only the first, only the second, and neither rank the right effect
+        first; and the two-sided p-value of the test.
     """
     wide = table.pivot_table(index=KEYS, columns="method", values="first", aggfunc="first")[[one, other]].dropna()
     mine, theirs = (wide[name].astype(bool) for name in (one, other))
     more, less = mine & ~theirs, theirs & ~mine
     lead = (more.astype(int) - less.astype(int)).groupby(level=["system", "effect"]).sum()
     ahead, behind = int((lead > 0).sum()), int((lead < 0).sum())
-    chance = float(binomtest(ahead, ahead + behind).pvalue) if ahead + behind else 1.0
-    return int((mine & theirs).sum()), int(more.sum()), int(less.sum()), int((~mine & ~theirs).sum()), chance
+    p = float(binomtest(ahead, ahead + behind).pvalue) if ahead + behind else 1.0
+    return int((mine & theirs).sum()), int(more.sum()), int(less.sum()), int((~mine & ~theirs).sum()), p
 
 
 def pairs(table: pd.DataFrame) -> str:
-    """Write how every two methods compare."""
+    """Return a table that compares every two methods."""
+    titles = ("both right", "only the first", "only the second", "neither")
     rows = []
     for one, other in itertools.combinations(METHODS, 2):
-        *counts, chance = split(table, one, other)
-        titles = ("both right", "only the first", "only the second", "neither")
-        rows.append(
-            {"first": one, "second": other, **dict(zip(titles, counts, strict=True)), "p": format_number(chance)}
-        )
-    return markdown(pd.DataFrame(rows))
+        *counts, p = split(table, one, other)
+        row = {"first": one, "second": other, **dict(zip(titles, counts, strict=True)), "p": format_number(p)}
+        rows.append(row)
+    return markdown(rows)
 
 
-def page(table: pd.DataFrame, about: dict[str, str]) -> str:
-    """Write the page."""
-    shared = common(table)
-    order = shared.groupby("method")["first"].mean().reindex(list(METHODS)).sort_values(ascending=False, kind="stable")
-    whole = table[table["method"] != SLOW]
-    means = whole.groupby("method")["first"].mean().reindex([name for name in METHODS if name != SLOW])
-    ranked = means.sort_values(ascending=False, kind="stable")
-    best, second = str(ranked.index[0]), str(ranked.index[1])
-    chance = split(table, best, second)[-1]
-    share = table.groupby("method")["share"].median()
-    seconds = table.groupby("method")["seconds"].median()
-    named = table[~table["first"] & (table["status"] == "ok")]
-    taken = {name: one["best"].value_counts().head(3) for name, one in named.groupby("method")}
-    wrong = "; ".join(
-        f"`{name}` " + ", ".join(f"{effect} {count}" for effect, count in taken[name].items())
-        for name in METHODS
-        if name in taken
+def confused(table: pd.DataFrame) -> str:
+    """Return the three effects that each method most often ranks first in place of the right one."""
+    wrong = table[~table["first"] & (table["status"] == "ok")]
+    counts = {name: wrong.loc[wrong["method"] == name, "best"].value_counts().head(3) for name in METHODS}
+    return "; ".join(
+        f"`{name}` " + ", ".join(f"{effect} {count}" for effect, count in mine.items())
+        for name, mine in counts.items()
+        if len(mine)
     )
+
+
+def in_short(table: pd.DataFrame) -> str:
+    """Return the findings of the page as a list."""
+    whole, methods = table[table["method"] != SLOW], table.groupby("method")
+    names = [name for name in METHODS if name != SLOW]
+    ranked = whole.groupby("method")["first"].mean().reindex(names).sort_values(ascending=False, kind="stable")
+    shared = common(table).groupby("method")["first"].mean().reindex(list(METHODS))
+    best, second = map(str, ranked.index[:2])
+    p = split(table, best, second)[-1]
+    return "\n".join(
+        [
+            "## In short\n",
+            f"- The right effect is ranked first in this share of {len(whole) // len(names)} trials: "
+            f"{each(ranked, percent)}. The lead of `{best}` over `{second}` is "
+            f"{'' if p < 0.05 else 'not '}significant (p = {format_number(p)}).",
+            "- On the trials that all methods were given: "
+            f"{each(shared.sort_values(ascending=False, kind='stable'), percent)}.",
+            "- With all the information in the recording the right effect would gain z^2, or slightly less where it "
+            "makes up much of the residual. Median of gain / z^2: "
+            f"{each(methods['share'].median().reindex(list(METHODS)))}. The rows of the curves (`splines`, `pinn-vp`) "
+            "only count as independent; a ratio above 1 would claim more certainty than the recording holds.",
+            "- Median processor seconds per trial (fit and one round of tracing): "
+            f"{each(methods['seconds'].median().reindex(list(METHODS)))}.",
+            f"- Most often ranked first in place of the right effect: {confused(table)}.",
+            "- The residual of the curves has a closed form. To first order, curves held to the equation by a penalty "
+            "W leave (A^T A + W)^-1 A^T rho, where rho is the residual of the trajectory in units of the noise and A "
+            "maps forces to readings. This is the force that ridge regression finds in rho: smoothed, shrunk and "
+            "correlated between sites. Undoing that needs A, and leads back to the test on the trajectory. This is "
+            "derived, not measured. W is the choice of each method's cross-validation, which aims at the coefficients "
+            "and not at the residual; no other W was measured.\n",
+        ]
+    )
+
+
+def page() -> str:
+    """Return the text of residuals.md, made from residuals.csv."""
+    text = (HERE / "residuals.csv").read_text(encoding="utf-8")
+    about = [line.removeprefix("# ") for line in text.splitlines() if line.startswith("# ")]
+    table = scored(pd.read_csv(HERE / "residuals.csv", comment="#"))
     parts = [
         "# Which residual gives the best diagnosis\n",
-        "Made by `python results/loop/residuals.py`, whose head says what each residual is and how it is traced; the trials are in "
-        f"[residuals.csv](residuals.csv). One round of tracing on recordings with one undeclared force of the size z, {percent(NOISE)} noise, "
-        f"25 sites, 50 samples; {len(CANDIDATES)} effects of the catalogue compete, those of the instrument being left out. `{SLOW}`, the slowest, "
-        f"is given every third specimen.\n",
-        "## In short\n",
-        "- Right effect ranked first: " + ", ".join(f"`{name}` {percent(v)}" for name, v in ranked.items())
-        + f" of {len(whole) // len(means)} specimens. That `{best}` is ahead of `{second}` is "
-        + ("more than chance" if chance < 0.05 else "no more than chance may do")
-        + f" (p = {format_number(chance)}).",
-        "- On the specimens that all were given: " + ", ".join(f"`{name}` {percent(v)}" for name, v in order.items()) + ".",
-        "- With all the information in the recording the right effect would gain z^2, or a little less where it makes up much of the "
-        "residual. Median share of it: "
-        + ", ".join(f"`{name}` {format_number(share[name])}" for name in METHODS)
-        + ". The curves' rows only count as independent; a share above 1 would be more certainty than there is.",
-        "- Processor seconds a diagnosis of one round: "
-        + ", ".join(f"`{name}` {format_number(seconds[name])}" for name in METHODS)
-        + ".",
-        "- Named instead of the right effect, most often: " + wrong + ".",
-        "- What the curves leave can be written down. Curves held to the equation by a penalty W have, to first order, the residual "
-        "(A^T A + W)^-1 A^T rho: the force that ridge regression finds in rho, the trajectory's residual in units of the noise, A being what "
-        "forces do to the readings. It is smoothed, shrunk and correlated from site to site; taking that back needs A, and then it is the "
-        "trajectory's test. This is algebra, not measured here. W is what each method's cross-validation takes, which has the coefficients "
-        "in mind and not the residual; other W were not tried here.\n",
-        "## All specimens\n", scores(whole), "Effects that are the same beside the declared terms are first together. "
-        "gain / z^2: median of twice the log likelihood ratio of the right effect over the size squared. seconds: median processor time, fit and trace.\n",
-        f"## The specimens that `{SLOW}` was given too\n", scores(shared),
-        "## In pairs\n", "Specimens that both were given; p: the chance of so uneven a split between two that are equally good (sign test, "
-        "each effect on a lattice counting once).\n",
+        "Made by `python results/loop/residuals.py`, which defines each residual and how it is traced; the trials are "
+        "in [residuals.csv](residuals.csv). Each is a recording of 25 sites and 50 samples with "
+        f"{percent(NOISE)} noise and one force that the declared equation lacks. z is the size of the force over the smallest standard error "
+        "that it can be known with. The residual is traced once, to every effect of the catalogue but those of the "
+        f"instrument. `{SLOW}`, the slowest method, was given every third trial.\n",
+        in_short(table),
+        "## All trials\n",
+        scores(table[table["method"] != SLOW]),
+        "Effects that are the same beside the declared terms share the first rank. gain / z^2: median of twice the log "
+        "likelihood ratio of the right effect, over z^2. seconds: median processor time of fit and trace.\n",
+        f"## The trials that `{SLOW}` was given\n",
+        scores(common(table)),
+        "## Methods in pairs\n",
+        "Trials that both methods were given, and the p-value of a two-sided sign test, in which each effect on a "
+        "lattice counts once.\n",
         pairs(table),
-        "## Lattices and sizes\n", "Right effect ranked first.\n", firsts(table, ["system", "z"]),
-        "## Effects\n", "Right effect ranked first, all lattices and sizes.\n", firsts(table, ["effect"]),
-        "".join(f"- {name}: {value}\n" for name, value in about.items()),
-    ]  # fmt: skip
+        "## Lattices and sizes\n",
+        "Trials in which the right effect is ranked first.\n",
+        firsts(table, ["system", "z"]),
+        "## Effects\n",
+        "Trials in which the right effect is ranked first, over all lattices and sizes.\n",
+        firsts(table, ["effect"]),
+        "".join(f"- {line}\n" for line in about),
+    ]
     return "\n".join(parts)
 
 
-def read() -> tuple[pd.DataFrame, dict[str, str]]:
-    """Read residuals.csv: the trials, and its head."""
-    path = HERE / "residuals.csv"
-    head = [line for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("# ")]
-    return pd.read_csv(path, comment="#"), dict(line.removeprefix("# ").split(": ", 1) for line in head)
-
-
 def main() -> None:
-    """Run the trials, or read them where only the page is asked for, and write both files."""
-    if "--page" in sys.argv[1:]:
-        table, about = read()
-        about["scored at"] = origin()["commit"]
-    else:
-        made = origin()
-        began = time.perf_counter()
-        table = trials()
+    """Run the trials, unless only the page is asked for, and write the page."""
+    if "--page" not in sys.argv[1:]:
+        made, began = origin(), time.perf_counter()
+        table = scored(run())
         about = {
-            "command": "python results/loop/residuals.py", "commit": made["commit"], "date": made["date"], "machine": made["machine"],
-            "versions": "; ".join(f"{name} {version}" for name, version in made["versions"].items()),
-            "seeds": ", ".join(map(str, SEEDS)), "minutes": f"{(time.perf_counter() - began) / 60:.0f}",
+            "command": "python results/loop/residuals.py", **made,
+            "effects": len(CANDIDATES), "seeds": SEEDS, "minutes": f"{(time.perf_counter() - began) / 60:.0f}",
         }  # fmt: skip
-    table = scored(table)
-    head = "".join(f"# {name}: {value}\n" for name, value in about.items())
-    write_text(HERE / "residuals.csv", head + table.to_csv(index=False, float_format="%.6g"))
-    write_text(HERE / "residuals.md", page(table, about))
+        head = "".join(f"# {line}\n" for line in lines(about))
+        write_text(HERE / "residuals.csv", head + table.to_csv(index=False, float_format="%.6g"))
+    write_text(HERE / "residuals.md", page())
 
 
 if __name__ == "__main__":
