@@ -390,9 +390,9 @@ def page() -> str:
         "# Which residual gives the best diagnosis\n",
         "Made by `python results/loop/residuals.py`, which defines each residual and how it is traced; the trials are "
         "in [residuals.csv](residuals.csv). Each is a recording of 25 sites and 50 samples with "
-        f"{percent(NOISE)} noise and one force that the declared equation lacks. z is the size of the force over the smallest standard error "
-        "that it can be known with. The residual is traced once, to every effect of the catalogue but those of the "
-        f"instrument. `{SLOW}`, the slowest method, was given every third trial.\n",
+        f"{percent(NOISE)} noise and one force that the declared equation lacks. z is the size of the force "
+        "over the smallest standard error that it can be known with. The residual is traced once, to every effect of "
+        f"the catalogue but those of the instrument. `{SLOW}`, the slowest method, was given every third trial.\n",
         in_short(table),
         "## All trials\n",
         scores(table[table["method"] != SLOW]),
