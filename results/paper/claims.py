@@ -1,17 +1,20 @@
-"""Hold the paper's remarks against a run of the suite `paper`, and write claims.md.
+"""Test the paper's remarks on a run of the suite `paper`, and write claims.md.
 
     latticebench run paper --results runs/paper
-    python results/paper/claims.py runs/paper
+    latticebench table runs/paper --out results/paper
+    python results/paper/claims.py runs/paper    # learning.csv and claims.md
+    python results/paper/claims.py               # claims.md again, from the tables beside it
 
-Each remark is told in brief, with the figures of the run and the conditioning of the library on the samples (the ratio of the largest to
-the smallest singular value of its columns, each scaled to length 1), and a verdict by a rule that stands beside it. A fit counts as
-right when its E2 is at most RIGHT.
+Every figure is computed from cases.csv, coefficients.csv and learning.csv beside this file. The last holds, per library
+and initial state, how many steps the network `pinn` needed (to two digits: an error is recorded every 100 steps). The
+verdict on a remark follows from the figures by a rule in the function of that remark.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,65 +22,48 @@ import numpy as np
 import pandas as pd
 
 from latticebench.bench.case import exact_regression, samples
-from latticebench.bench.provenance import describe, lines
-from latticebench.bench.publish import format_number
+from latticebench.bench.publish import render
 from latticebench.bench.store import open_store
 from latticebench.bench.suite import Case, load
-from latticebench.bench.tables import cases
+from latticebench.bench.tables import read_cases
 from latticebench.systems.files import write_text
 
+HERE = Path(__file__).parent
+# A fit is right if its E2 is at most this.
 RIGHT = 0.05
-# A learning curve has arrived when its error stays below this.
+# A network has learnt the coefficients when their error stays below this.
 LEARNT = 0.1
 NETWORKS = ("pinn", "pinn-vp")
+IN_MOTION = ("1a", "1b", "motion")
 
 
-def rows(table: pd.DataFrame, part: str | Sequence[str], **equal: Any) -> pd.DataFrame:
-    """Take the cases of some parts, and of them those with the given values."""
-    parts = [part] if isinstance(part, str) else list(part)
-    chosen = table[table["part"].isin(parts)]
-    for name, value in equal.items():
-        chosen = chosen[chosen[name] == value]
-    return chosen
+@dataclass(frozen=True)
+class Run:
+    """The tables of a run: one row per case, per coefficient, and per learning curve."""
+
+    cases: pd.DataFrame
+    coefficients: pd.DataFrame
+    learning: pd.DataFrame
 
 
-def shown(table: pd.DataFrame, columns: Sequence[str]) -> str:
-    """Write columns of a table as Markdown."""
-    readable = table[list(columns)].copy()
-    for name in readable.columns:
-        if pd.api.types.is_float_dtype(readable[name]):
-            readable[name] = [format_number(value) for value in readable[name]]
-    return str(readable.astype(str).to_markdown(index=False, disable_numparse=True))
+@dataclass(frozen=True)
+class Verdict:
+    """What the figures say of a remark: "holds" or not, the figures that decide, and the table that they are from."""
+
+    verdict: str
+    text: str
+    table: pd.DataFrame
 
 
-def even_terms(table: pd.DataFrame, _results: Sequence[Any]) -> tuple[str, str, str]:
-    """Even terms need the mirrored data."""
-    chosen = rows(table, "even")
-    alone = chosen[chosen["library"] == "lib2-even"]
-    plain = alone[~alone["data"].str.contains("with -u")].set_index("method")["e2"]
-    least = alone[alone["method"] == "least-squares"].set_index("data")["e2"]
-    needed = plain["pinn"] > RIGHT and plain["pinn-mirror"] <= RIGHT
-    verdict = "holds" if needed else "does not hold"
-    gain = plain["pinn"] / plain["pinn-mirror"]
-    text = (
-        f"The network finds the library with even terms without the mirrored data (E2 {plain['pinn']:.1e}) as well as with them "
-        f"({plain['pinn-mirror']:.1e}; a factor of {gain:.2g}), and so does least squares "
-        f"({least.iloc[0]:.1e}, {least.iloc[-1]:.1e} with them)."
-    )
-    return (
-        verdict,
-        text,
-        shown(chosen, ["data", "library", "method", "e2", "spurious", "tpr", "conditioning", "cpu_seconds"]),
-    )
+def learning(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return how many sites each initial state of phi^4 sets in motion, and how many steps `pinn` needed.
 
-
-def motion(_table: pd.DataFrame, results: Sequence[Any]) -> tuple[str, str, str]:
-    """More sites in motion mean faster learning."""
+    The number of sites in motion is the participation number (sum e)^2 / sum e^2 with e_n the mean of v_n^2 over time.
+    """
     found = []
     for result in results:
         case = Case.model_validate(result["case"])
-        is_kink = case.part in ("1a", "1b")
-        if (case.part != "motion" and not is_kink) or case.label != "pinn" or result["history"] is None:
+        if case.part not in IN_MOTION or case.label != "pinn" or result["history"] is None:
             continue
         clean = samples(case, Path())[0]
         assert clean.v is not None
@@ -87,167 +73,230 @@ def motion(_table: pd.DataFrame, results: Sequence[Any]) -> tuple[str, str, str]
         curve = np.linalg.norm(np.array(result["history"]["coefficients"]) - truth, axis=1) / np.linalg.norm(truth)
         late = np.flatnonzero(curve > LEARNT)
         after = int(late[-1]) + 1 if len(late) else 0
-        steps = result["history"]["step"][after] if after < len(curve) else np.inf
+        steps = float(result["history"]["step"][after]) if after < len(curve) else np.inf
         start = case.initial or f"kink, v = {case.parameters.get('v', 0):g}"
-        found.append([case.library, start, moving, result["conditioning"], steps, float(result["e2"])])
-    frame = pd.DataFrame(
-        found, columns=["library", "start", "sites in motion", "conditioning", f"steps to E2 <= {LEARNT}", "e2"]
-    )
-    frame = frame.sort_values(["library", "sites in motion"])
-    by_motion, by_condition = [], []
-    for _, group in frame.groupby("library"):
-        rank = group.rank(numeric_only=True)
-        steps = rank[f"steps to E2 <= {LEARNT}"]
-        by_motion.append(float(np.corrcoef(rank["sites in motion"], steps)[0, 1]))
-        by_condition.append(float(np.corrcoef(rank["conditioning"], steps)[0, 1]))
-    motion_rank, condition_rank = float(np.mean(by_motion)), float(np.mean(by_condition))
-    verdict = "holds" if motion_rank <= -0.5 else ("holds only in part" if motion_rank <= -0.2 else "does not hold")
+        found.append([case.data, case.library, start, moving, float(f"{steps:.2g}")])
+    return pd.DataFrame(found, columns=["data", "library", "start", "sites in motion", "steps"])
+
+
+# The remarks ----------------------------------------------------------------------------------------------------------
+
+
+def of_parts(table: pd.DataFrame, *parts: str) -> pd.DataFrame:
+    """Return the rows of some parts of the suite."""
+    return table[table["part"].isin(parts)]
+
+
+def even_terms(run: Run) -> Verdict:
+    """Judge whether even-ordered terms need the mirrored data: it holds if `pinn` is right only with them."""
+    chosen = of_parts(run.cases, "even")
+    alone = chosen[chosen["library"] == "lib2-even"]
+    network = alone[~alone["data"].str.contains("with -u")].set_index("method")["e2"]
+    least = alone[alone["method"] == "least-squares"]["e2"]
+    without, mirrored = float(network["pinn"]), float(network["pinn-mirror"])
     text = (
-        "Sites in motion are counted as (sum e)^2 / sum e^2 with e_n the mean of v_n^2. Rank correlation of the steps needed with the "
-        f"sites in motion: {motion_rank:.2f}; with the conditioning of the library: {condition_rank:.2f} (means over the two libraries, "
-        "five states each)."
+        f"E2 with the even terms in the library: of the network, {without:.1e} without the mirrored data and "
+        f"{mirrored:.1e} with them (a factor of {without / mirrored:.2g}); of least squares, {least.iloc[0]:.1e} "
+        f"without and {least.iloc[-1]:.1e} with them."
     )
-    return verdict, text, shown(frame, frame.columns)
+    columns = ["data", "library", "method", "e2", "spurious", "tpr", "conditioning", "cpu_seconds"]
+    return Verdict("holds" if without > RIGHT >= mirrored else "does not hold", text, chosen[columns])
 
 
-def size(table: pd.DataFrame, _results: Sequence[Any]) -> tuple[str, str, str]:
-    """Hold against the figures that the size of the lattice does not matter."""
-    chosen = rows(table, ["size", "1b"])
+def motion(run: Run) -> Verdict:
+    """Judge whether more sites in motion mean faster learning, by the rank correlation of the two."""
+    pinn = of_parts(run.cases, *IN_MOTION)
+    pinn = pinn[pinn["method"] == "pinn"][["data", "library", "conditioning", "e2"]]
+    table = run.learning.merge(pinn, on=["data", "library"]).sort_values(["library", "sites in motion"])
+    ranks = [group.rank(numeric_only=True).corr()["steps"] for _, group in table.groupby("library")]
+    mean = pd.concat(ranks, axis=1).mean(axis=1)
+    by_motion = mean["sites in motion"]
+    verdict = "holds" if by_motion <= -0.5 else ("holds only in part" if by_motion <= -0.2 else "does not hold")
+    text = (
+        "The number of sites in motion is (sum e)^2 / sum e^2 with e_n the mean of v_n^2 over time. Rank correlation "
+        f"between the steps needed and the sites in motion: {by_motion:.2f}; between the steps and the conditioning: "
+        f"{mean['conditioning']:.2f} (means over the two libraries, five initial states each)."
+    )
+    table = table.rename(columns={"steps": f"steps to E2 <= {LEARNT}"})
+    columns = ["library", "start", "sites in motion", "conditioning", f"steps to E2 <= {LEARNT}", "e2"]
+    return Verdict(verdict, text, table[columns])
+
+
+def size(run: Run) -> Verdict:
+    """Judge whether the lattice size does not matter: it holds if every fit from 20 to 31 sites is right."""
+    chosen = of_parts(run.cases, "size", "1b")
     chosen = chosen[chosen["method"].isin([*NETWORKS, "least-squares"])].sort_values(["method", "data"])
-    spread = {m: float(g["e2"].max() / g["e2"].min()) for m, g in chosen.groupby("method")}
     worst = float(chosen["e2"].max())
-    verdict = "holds" if worst <= RIGHT else "does not hold"
-    text = f"From 20 to 31 sites every fit is right (worst E2 {worst:.1e}); largest over smallest error: " + ", ".join(
-        f"{name} {value:.2g}" for name, value in spread.items()
+    spread = chosen.groupby("method")["e2"].agg(lambda e2: e2.max() / e2.min())
+    text = f"Worst E2 from 20 to 31 sites: {worst:.1e}. Largest over smallest E2: " + ", ".join(
+        f"`{name}` {value:.2g}" for name, value in spread.items()
     )
-    return verdict, text + ".", shown(chosen, ["data", "method", "e2", "conditioning", "cpu_seconds"])
+    columns = ["data", "method", "e2", "conditioning", "cpu_seconds"]
+    return Verdict("holds" if worst <= RIGHT else "does not hold", text + ".", chosen[columns])
 
 
-def imaginary(_table: pd.DataFrame, results: Sequence[Any]) -> tuple[str, str, str]:
-    """DNLS coefficients come out purely imaginary."""
-    found = []
-    for result in results:
-        case = Case.model_validate(result["case"])
-        if case.part in ("2a", "2b", "3a", "3b") and result["coefficients"] is not None and case.label != "oracle":
-            values = result["coefficients"]
-            real = max(abs(value) for term, value in values.items() if not term.startswith("i*"))
-            found.append(
-                [
-                    case.part,
-                    case.label,
-                    real,
-                    real / np.linalg.norm(list(values.values())),
-                    float(result["e2"]),
-                    result["conditioning"],
-                ]
-            )
-    frame = pd.DataFrame(found, columns=["panel", "method", "largest real part", "share", "e2", "conditioning"])
-    worst = {name: float(frame[frame["method"] == name]["share"].max()) for name in NETWORKS}
-    verdict = "holds" if max(worst.values()) <= RIGHT else "does not hold"
-    text = "Largest real part of any coefficient, as a share of the length of all of them: " + ", ".join(
-        f"{name} at most {value:.1e}" for name, value in worst.items()
+def imaginary(run: Run) -> Verdict:
+    """Judge whether DNLS coefficients come out imaginary: it holds if the real parts of the networks are small."""
+    panels = ("2a", "2b", "3a", "3b")
+    chosen = of_parts(run.coefficients, *panels)
+    keys = ["part", "data", "library", "method"]
+    found = chosen[chosen["method"] != "oracle"].assign(
+        real=lambda table: table["coefficient"].abs().where(~table["term"].str.startswith("i*"), 0.0)
     )
-    return verdict, text + ".", shown(frame, frame.columns)
+    groups = found.groupby(keys, sort=False)
+    norms = groups["coefficient"].agg(lambda values: float(np.linalg.norm(values)))
+    table = pd.DataFrame({"largest real part": groups["real"].max()})
+    table["share"] = table["largest real part"] / norms
+    table = table.reset_index().merge(of_parts(run.cases, *panels)[[*keys, "e2", "conditioning"]], on=keys)
+    worst = {name: float(table.loc[table["method"] == name, "share"].max()) for name in NETWORKS}
+    text = "Largest real part of any coefficient, as a share of the norm of all coefficients: " + ", ".join(
+        f"`{name}` at most {value:.1e}" for name, value in worst.items()
+    )
+    table = table.rename(columns={"part": "panel"})
+    columns = ["panel", "method", "largest real part", "share", "e2", "conditioning"]
+    return Verdict("holds" if max(worst.values()) <= RIGHT else "does not hold", text + ".", table[columns])
 
 
-def complex_ones(table: pd.DataFrame, _results: Sequence[Any]) -> tuple[str, str, str]:
-    """DCGL's complex coefficients come out right, with the larger libraries too."""
-    chosen = rows(table, ["4a", "4b", "larger"])
+def complex_coefficients(run: Run) -> Verdict:
+    """Judge whether complex coefficients come out right: it holds if every fit of the networks is right."""
+    chosen = of_parts(run.cases, "4a", "4b", "larger")
     networks = chosen[chosen["method"].isin(NETWORKS)]
-    verdict = "holds" if (networks["e2"] <= RIGHT).all() else "does not hold"
-    text = f"Worst E2 of the networks: {networks['e2'].max():.1e} ({networks.loc[networks['e2'].idxmax(), 'library']})."
-    return (
-        verdict,
-        text,
-        shown(chosen, ["part", "data", "library", "method", "e2", "spurious", "tpr", "conditioning", "cpu_seconds"]),
-    )
+    worst = networks.loc[networks["e2"].idxmax()]
+    text = f"Worst E2 of the networks: {worst['e2']:.1e} (library `{worst['library']}`)."
+    columns = ["part", "data", "library", "method", "e2", "spurious", "tpr", "conditioning", "cpu_seconds"]
+    return Verdict("holds" if worst["e2"] <= RIGHT else "does not hold", text, chosen[columns])
 
 
-def sines(table: pd.DataFrame, results: Sequence[Any]) -> tuple[str, str, str]:
-    """Sines are found, powers only approximate them, and the mixed library competes, the initial state deciding."""
-    chosen = rows(table, ["5a", "5b", "5c", "initial"])
-    pinn = chosen[chosen["method"] == "pinn"].set_index(["part", "library"])["e2"]
-    best = chosen[chosen["method"] == "pinn-vp"].set_index(["part", "library"])["e2"]
-    found, mixed = pinn["5a", "sines"] <= RIGHT, pinn["5c", "mixed"] <= RIGHT
-    mixed_other = pinn["initial", "mixed"] <= RIGHT
-    decides = mixed != mixed_other or (pinn["5a", "sines"] <= RIGHT) != (pinn["initial", "sines"] <= RIGHT)
-    verdict = "holds" if found and decides else ("holds only in part" if found else "does not hold")
-    gap = powers_gap(results)
+def sines(run: Run) -> Verdict:
+    """Judge whether sines are found and the initial state decides; it holds in part if they are found anyway."""
+    chosen = of_parts(run.cases, "5a", "5b", "5c", "initial")
+    e2 = chosen.set_index(["method", "part", "library"])["e2"]
+    right = e2["pinn"] <= RIGHT
+    found = right["5a", "sines"]
+    decides = right["5c", "mixed"] != right["initial", "mixed"] or found != right["initial", "sines"]
+
+    def errors(part: str, library: str) -> str:
+        own, other = (" and ".join(f"{e2[name, one, library]:.1e}" for name in NETWORKS) for one in (part, "initial"))
+        return f"{own} from the kink of sine-Gordon, {other} from the kink of phi^4"
+
     text = (
-        f"From its own kink the sine is found (pinn E2 {pinn['5a', 'sines']:.1e}, pinn-vp {best['5a', 'sines']:.1e}); from the kink of phi^4 "
-        f"pinn has {pinn['initial', 'sines']:.1e}, pinn-vp {best['initial', 'sines']:.1e}. Mixed library: own kink {pinn['5c', 'mixed']:.1e} "
-        f"and {best['5c', 'mixed']:.1e}, kink of phi^4 {pinn['initial', 'mixed']:.1e} and {best['initial', 'mixed']:.1e}. The conditioning tells why: "
-        "below |u| = 1.3 the powers and the sines are nearly the same functions.\n\n"
-        "The powers alone have no truth. Against least squares on the exact derivative of the noise-free state:\n\n"
-        + gap
+        f"E2 of `pinn` and `pinn-vp` with the sines: {errors('5a', 'sines')}. With the mixed library: "
+        f"{errors('5c', 'mixed')}. The conditioning shows why: below |u| = 1.3 powers and sines are nearly the same "
+        "functions.\n\n"
+        "The equation has no truth in powers alone. Their fits from the kink of sine-Gordon, beside least squares on "
+        f"the exact derivative of the noise-free state:\n\n{markdown(powers(run))}"
     )
-    return (
-        verdict,
-        text,
-        shown(chosen, ["part", "data", "library", "method", "e2", "residual", "conditioning", "cpu_seconds"]),
+    verdict = "holds" if found and decides else ("holds only in part" if found else "does not hold")
+    columns = ["part", "data", "library", "method", "e2", "residual", "conditioning", "cpu_seconds"]
+    return Verdict(verdict, text, chosen[columns])
+
+
+def powers(run: Run) -> pd.DataFrame:
+    """Compare the fits of panel (5b), coefficient by coefficient, with least squares on the exact derivative."""
+    case = next(case for case in load("paper").cases if case.part == "5b")
+    _, library = case.resolve(Path())
+    exact = exact_regression(samples(case, Path()), library).least_squares()
+    found = {"exact least squares": exact}
+    for name, group in of_parts(run.coefficients, "5b").groupby("method", sort=False):
+        found[str(name)] = group.set_index("term")["coefficient"].loc[list(library.texts)].to_numpy()
+    table = pd.DataFrame({"method": list(found)})
+    for column, term in enumerate(library.texts):
+        table[f"`{term}`"] = [f"{values[column]:.4g}" for values in found.values()]
+    table["distance"] = [np.linalg.norm(values - exact) / np.linalg.norm(exact) for values in found.values()]
+    return table
+
+
+@dataclass(frozen=True)
+class Remark:
+    """A remark of the paper: a title, what the paper says, and the function that judges it."""
+
+    title: str
+    paper: str
+    judge: Callable[[Run], Verdict]
+
+
+REMARKS = (
+    Remark(
+        "Even-ordered terms need the mirrored data",
+        "libraries with quadratic and quartic terms are learnt only with both u and -u (section 4.3)",
+        even_terms,
+    ),
+    Remark(
+        "More sites in motion mean faster learning",
+        "initial states that set more sites in motion lead to faster learning (section 4)",
+        motion,
+    ),
+    Remark(
+        "The lattice size does not matter",
+        "between 20 and 31 sites the results do not change in a dramatic way (section 4)",
+        size,
+    ),
+    Remark(
+        "DNLS coefficients come out purely imaginary",
+        "the real parts converge to zero: the scheme detects that the model conserves (section 4.3)",
+        imaginary,
+    ),
+    Remark(
+        "Ginzburg-Landau's complex coefficients come out right",
+        "also with the libraries of ten and nine terms, and with next-to-next neighbours (section 4.3)",
+        complex_coefficients,
+    ),
+    Remark(
+        "Sines are found, powers approximate, the mixed library competes",
+        "the initial state decides which library works (section 4.3)",
+        sines,
+    ),
+)
+
+
+# The page -------------------------------------------------------------------------------------------------------------
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """Return a table as Markdown, numbers with two digits."""
+    return render(table, {}, "md").rstrip()
+
+
+def head(path: Path) -> list[str]:
+    """Return the lines at the head of a table that say where it comes from."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [line.removeprefix("# ") for line in lines if line.startswith("# ")]
+
+
+def page() -> str:
+    """Return the text of claims.md, made from the tables beside this file."""
+    coefficients, learnt = (pd.read_csv(HERE / f"{name}.csv", comment="#") for name in ("coefficients", "learning"))
+    run = Run(read_cases(HERE / "cases.csv"), coefficients, learnt)
+    verdicts = [remark.judge(run) for remark in REMARKS]
+    return "\n".join(
+        [
+            "# The paper's remarks, tested on a run\n",
+            f"Made by `python results/paper/claims.py` from a run of the suite `paper`. A fit is right if E2 <= "
+            f"{RIGHT}. `pinn` is the paper's network, `pinn-vp` the best network of this project; all methods saw the "
+            "same samples. conditioning: the ratio of the largest to the smallest singular value of the library's "
+            "columns on the samples, each scaled to length 1.\n",
+            "| remark | verdict |",
+            "|---|---|",
+            *(f"| {remark.title} | {one.verdict} |" for remark, one in zip(REMARKS, verdicts, strict=True)),
+            "",
+            *(
+                f"## {remark.title}: {one.verdict}\n\nThe paper: {remark.paper}.\n\n{one.text}\n\n"
+                f"{markdown(one.table)}\n"
+                for remark, one in zip(REMARKS, verdicts, strict=True)
+            ),
+            "".join(f"- {line}\n" for line in head(HERE / "cases.csv")),
+        ]
     )
-
-
-def powers_gap(results: Sequence[Any]) -> str:
-    """Compare the fits of (5b) with least squares on exact derivatives, coefficient by coefficient."""
-    columns: dict[str, list[float]] = {}
-    distances = {}
-    terms: list[str] = []
-    for result in results:
-        case = Case.model_validate(result["case"])
-        if case.part != "5b" or result["coefficients"] is None:
-            continue
-        if not columns:
-            _, candidates = case.resolve(Path())
-            terms = list(candidates.texts)
-            columns["exact least squares"] = (
-                exact_regression(samples(case, Path()), candidates).least_squares().tolist()
-            )
-        columns[case.label] = list(result["coefficients"].values())
-    exact = np.array(columns["exact least squares"])
-    for name, values in columns.items():
-        distances[name] = float(np.linalg.norm(np.array(values) - exact) / np.linalg.norm(exact))
-    frame = pd.DataFrame(
-        {"method": list(columns), **{t: [v[k] for v in columns.values()] for k, t in enumerate(terms)}}
-    )
-    frame["distance"] = list(distances.values())
-    for name in terms:
-        frame[name] = [f"{value:.4g}" for value in frame[name]]
-    frame.columns = pd.Index([f"`{name}`" if name in terms else name for name in frame.columns])
-    return shown(frame, frame.columns)
-
-
-CLAIMS: list[tuple[str, str, Callable[..., tuple[str, str, str]]]] = [
-    ("Even-ordered terms need the mirrored data", "libraries with quadratic and quartic terms are learnt only with both u and -u (section 4.3)", even_terms),
-    ("More sites in motion mean faster learning", "initial states that set more sites in motion lead to faster learning (section 4)", motion),
-    ("The lattice size does not matter", "between 20 and 31 sites the results do not change in a dramatic way (section 4)", size),
-    ("DNLS coefficients come out purely imaginary", "the real parts converge to zero: the scheme detects that the model conserves (section 4.3)", imaginary),
-    ("Ginzburg-Landau's complex coefficients come out right", "also with the ten- and nine-term libraries and next-to-next neighbours (section 4.3)", complex_ones),
-    ("Sines are found, powers approximate, the mixed library competes", "and the initial state decides which library works (section 4.3)", sines),
-]  # fmt: skip
 
 
 def main() -> None:
-    """Write claims.md beside this file from the store given on the command line."""
-    store = open_store(Path(sys.argv[1]))
-    results = store.all()
-    table = cases(results)
-    expected = len(load("paper").cases)
-    if len(results) != expected:
-        raise SystemExit(f"the store has {len(results)} of the suite's {expected} results; run it to its end first")
-    parts = [
-        "# The paper's remarks, and what a run says of them\n",
-        f"Made by `python results/paper/claims.py` from a run of the suite `paper`. A fit is right when E2 <= {RIGHT}. `pinn` is the paper's "
-        "network, `pinn-vp` this project's best; the methods beside them had the same samples.\n",
-    ]
-    overview = []
-    for title, words, judge in CLAIMS:
-        verdict, text, figures = judge(table, results)
-        overview.append(f"| {title} | {verdict} |")
-        parts.append(f"## {title}: {verdict}\n\nThe paper: {words}.\n\n{text}\n\n{figures}\n")
-    parts.insert(2, "| remark | verdict |\n|---|---|\n" + "\n".join(overview) + "\n")
-    parts.append("".join(f"- {line}\n" for line in lines(describe(results, store.about()))))
-    write_text(Path(__file__).parent / "claims.md", "\n".join(parts))
+    """Write learning.csv if a store is given on the command line, and claims.md."""
+    if len(sys.argv) > 1:
+        results, expected = open_store(Path(sys.argv[1])).all(), len(load("paper").cases)
+        if len(results) != expected:
+            raise SystemExit(f"the store has {len(results)} of the suite's {expected} results; finish the run first")
+        write_text(HERE / "learning.csv", learning(results).to_csv(index=False))
+    write_text(HERE / "claims.md", page())
 
 
 if __name__ == "__main__":

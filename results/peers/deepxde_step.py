@@ -35,7 +35,7 @@ import pandas as pd
 
 from latticebench import systems
 from latticebench.bench.provenance import origin
-from latticebench.bench.tables import render
+from latticebench.bench.publish import render
 from latticebench.methods.pinn import PINN
 from latticebench.systems.files import write_text
 from latticebench.systems.simulate import simulate
