@@ -74,6 +74,7 @@ SURROGATES = 100
 NOISE = 0.01
 # The slowest method is given every third trial.
 SLOW = "pinn-vp"
+# A residual along curves is averaged over at least this many stretches.
 LEAST_STRETCHES = 6
 SCORES = {"first": "ranked first", "two": "within the first two", "near": f"within {EQUAL:g} nats of the first"}
 
@@ -134,12 +135,12 @@ def along(
 
 
 def by_trajectory(model: Model, samples: Samples) -> Tangent:
-    """Trace the readings less the shooting fit."""
+    """Return the tangent of the readings less the shooting fit."""
     return linearise(first_fit(model, [samples]))
 
 
 def by_weak(model: Model, samples: Samples) -> Tangent:
-    """Trace the whitened residual of the weak equations; no declared term is dropped."""
+    """Return the tangent of the whitened residual of the weak equations; no declared term is dropped."""
     default = Weak()
     form = WeakForm(samples, model.declared, model.order, default.half_width, default.power)
     found = estimate([form], np.ones(len(model.declared.terms), dtype=bool), default.rounds)
@@ -157,7 +158,7 @@ def by_weak(model: Model, samples: Samples) -> Tangent:
 
 
 def by_curves(name: str) -> Callable[[Model, Samples], Tangent]:
-    """Trace the derivative less the declared terms along a method's curves."""
+    """Return the function that makes the tangent of the derivative less the declared terms, along a method's curves."""
 
     def make(model: Model, samples: Samples) -> Tangent:
         fit = solve(methods.find(name)(), [samples], model.declared, model.order, 1)
