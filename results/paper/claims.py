@@ -38,7 +38,7 @@ IN_MOTION = ("1a", "1b", "motion")
 
 
 @dataclass(frozen=True)
-class Run:
+class Tables:
     """The tables of a run: one row per case, per coefficient, and per learning curve."""
 
     cases: pd.DataFrame
@@ -47,7 +47,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Judgement:
     """What the figures say of a remark: "holds" or not, the figures that decide, and the table that they are from."""
 
     verdict: str
@@ -87,7 +87,7 @@ def of_parts(table: pd.DataFrame, *parts: str) -> pd.DataFrame:
     return table[table["part"].isin(parts)]
 
 
-def even_terms(run: Run) -> Verdict:
+def even_terms(run: Tables) -> Judgement:
     """Judge whether even-ordered terms need the mirrored data: it holds if `pinn` is right only with them."""
     chosen = of_parts(run.cases, "even")
     alone = chosen[chosen["library"] == "lib2-even"]
@@ -100,10 +100,10 @@ def even_terms(run: Run) -> Verdict:
         f"without and {least.iloc[-1]:.1e} with them."
     )
     columns = ["data", "library", "method", "e2", "spurious", "tpr", "conditioning", "cpu_seconds"]
-    return Verdict("holds" if without > RIGHT >= mirrored else "does not hold", text, chosen[columns])
+    return Judgement("holds" if without > RIGHT >= mirrored else "does not hold", text, chosen[columns])
 
 
-def motion(run: Run) -> Verdict:
+def motion(run: Tables) -> Judgement:
     """Judge whether more sites in motion mean faster learning, by the rank correlation of the two."""
     pinn = of_parts(run.cases, *IN_MOTION)
     pinn = pinn[pinn["method"] == "pinn"][["data", "library", "conditioning", "e2"]]
@@ -119,10 +119,10 @@ def motion(run: Run) -> Verdict:
     )
     table = table.rename(columns={"steps": f"steps to E2 <= {LEARNT}"})
     columns = ["library", "start", "sites in motion", "conditioning", f"steps to E2 <= {LEARNT}", "e2"]
-    return Verdict(verdict, text, table[columns])
+    return Judgement(verdict, text, table[columns])
 
 
-def size(run: Run) -> Verdict:
+def size(run: Tables) -> Judgement:
     """Judge whether the lattice size does not matter: it holds if every fit from 20 to 31 sites is right."""
     chosen = of_parts(run.cases, "size", "1b")
     chosen = chosen[chosen["method"].isin([*NETWORKS, "least-squares"])].sort_values(["method", "data"])
@@ -132,10 +132,10 @@ def size(run: Run) -> Verdict:
         f"`{name}` {value:.2g}" for name, value in spread.items()
     )
     columns = ["data", "method", "e2", "conditioning", "cpu_seconds"]
-    return Verdict("holds" if worst <= RIGHT else "does not hold", text + ".", chosen[columns])
+    return Judgement("holds" if worst <= RIGHT else "does not hold", text + ".", chosen[columns])
 
 
-def imaginary(run: Run) -> Verdict:
+def imaginary(run: Tables) -> Judgement:
     """Judge whether DNLS coefficients come out imaginary: it holds if the real parts of the networks are small."""
     panels = ("2a", "2b", "3a", "3b")
     chosen = of_parts(run.coefficients, *panels)
@@ -154,20 +154,20 @@ def imaginary(run: Run) -> Verdict:
     )
     table = table.rename(columns={"part": "panel"})
     columns = ["panel", "method", "largest real part", "share", "e2", "conditioning"]
-    return Verdict("holds" if max(worst.values()) <= RIGHT else "does not hold", text + ".", table[columns])
+    return Judgement("holds" if max(worst.values()) <= RIGHT else "does not hold", text + ".", table[columns])
 
 
-def complex_coefficients(run: Run) -> Verdict:
+def complex_coefficients(run: Tables) -> Judgement:
     """Judge whether complex coefficients come out right: it holds if every fit of the networks is right."""
     chosen = of_parts(run.cases, "4a", "4b", "larger")
     networks = chosen[chosen["method"].isin(NETWORKS)]
     worst = networks.loc[networks["e2"].idxmax()]
     text = f"Worst E2 of the networks: {worst['e2']:.1e} (library `{worst['library']}`)."
     columns = ["part", "data", "library", "method", "e2", "spurious", "tpr", "conditioning", "cpu_seconds"]
-    return Verdict("holds" if worst["e2"] <= RIGHT else "does not hold", text, chosen[columns])
+    return Judgement("holds" if worst["e2"] <= RIGHT else "does not hold", text, chosen[columns])
 
 
-def sines(run: Run) -> Verdict:
+def sines(run: Tables) -> Judgement:
     """Judge whether sines are found and the initial state decides; it holds in part if they are found anyway."""
     chosen = of_parts(run.cases, "5a", "5b", "5c", "initial")
     e2 = chosen.set_index(["method", "part", "library"])["e2"]
@@ -188,10 +188,10 @@ def sines(run: Run) -> Verdict:
     )
     verdict = "holds" if found and decides else ("holds only in part" if found else "does not hold")
     columns = ["part", "data", "library", "method", "e2", "residual", "conditioning", "cpu_seconds"]
-    return Verdict(verdict, text, chosen[columns])
+    return Judgement(verdict, text, chosen[columns])
 
 
-def powers(run: Run) -> pd.DataFrame:
+def powers(run: Tables) -> pd.DataFrame:
     """Compare the fits of panel (5b), coefficient by coefficient, with least squares on the exact derivative."""
     case = next(case for case in load("paper").cases if case.part == "5b")
     _, library = case.resolve(Path())
@@ -212,7 +212,7 @@ class Remark:
 
     title: str
     paper: str
-    judge: Callable[[Run], Verdict]
+    judge: Callable[[Tables], Judgement]
 
 
 REMARKS = (
@@ -266,7 +266,7 @@ def head(path: Path) -> list[str]:
 def page() -> str:
     """Return the text of claims.md, made from the tables beside this file."""
     coefficients, learnt = (pd.read_csv(HERE / f"{name}.csv", comment="#") for name in ("coefficients", "learning"))
-    run = Run(read_cases(HERE / "cases.csv"), coefficients, learnt)
+    run = Tables(read_cases(HERE / "cases.csv"), coefficients, learnt)
     verdicts = [remark.judge(run) for remark in REMARKS]
     return "\n".join(
         [
