@@ -1,32 +1,35 @@
-"""The statistical limit: how well any method could know the coefficients from given samples.
+"""The statistical limit: how accurately any method could know the coefficients from given samples.
 
-For samples y = u(t) + noise (independent, Gaussian, sigma known) of a motion with unknown start, no unbiased estimate has a
-covariance below the inverse of the Fisher matrix sum (d y/d p)^T (d y/d p) / sigma^2, p being the coefficients, the whole
-initial state and, at unknown ends, the splines that the sites without an equation follow (Cramer, Mathematical Methods of
-Statistics (1946), section 32.3; Rao, Bull. Calcutta Math. Soc. 37, 81 (1945)). The derivatives come from the variational
-equations (`systems.sensitivity`). The bound scales with the noise.
+For samples y = u(t) + noise (independent, Gaussian, sigma known) of a motion with unknown start, no unbiased estimate
+has a covariance below the inverse of the Fisher matrix sum (d y/d p)^T (d y/d p) / sigma^2. The parameters p are the
+coefficients, the whole initial state and, at unknown ends, the splines that the sites without an equation follow
+(Cramer, Mathematical Methods of Statistics (1946), section 32.3; Rao, Bull. Calcutta Math. Soc. 37, 81 (1945)). The
+derivatives come from the variational equations (`latticebench.methods.engine.sensitivity`). The bound is proportional
+to the noise.
 
-Values that were not observed (NaN in the data) carry no weight. A measured input counts as known; between its samples it is
-their cubic spline.
+Values that were not observed (NaN in the data) carry no weight. A measured input counts as known; between its samples
+it is their cubic spline.
 
-Unknown ends: the bound takes one B-spline coefficient a sample and site for the unknown motion there, as free as the samples
-allow; the bound for known ends is lower.
+At unknown ends the bound takes one B-spline coefficient per sample and site for the unknown motion there, which is as
+free as the samples allow; the bound for known ends is lower.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.methods.engine.sensitivity import Drive, Dynamics, Stretches, condense, split_parts
+from latticebench.methods.engine.bsplines import BSplines
+from latticebench.methods.engine.condensing import condense
+from latticebench.methods.engine.dynamics import Dynamics, split_parts
+from latticebench.methods.engine.sensitivity import Stretches
 from latticebench.systems.errors import InputError
-from latticebench.systems.lattice import Library, System
+from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples, SimulatedSamples
-from latticebench.systems.simulate import noise_size, simulate
-from latticebench.systems.stencil import Ends
+from latticebench.systems.simulate import noise_size
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -34,10 +37,10 @@ if TYPE_CHECKING:
 
     from latticebench.methods.method import Fit
 
-# A coefficient or a sum counts as known below this relative error, and as roughly known while it can be told from 0.
+# A coefficient or a sum counts as known below the first relative error, and as roughly known below the second.
 KNOWN = 0.1
 ROUGH = 0.5
-# Estimates correlated more than this are told as a group.
+# Terms whose estimates are correlated more than this form a group.
 TOGETHER = 0.9
 # Larger groups are counted instead of listed in a verdict.
 LISTED = 4
@@ -80,14 +83,18 @@ class Limit:
 
     @property
     def errors(self) -> Float[ndarray, " terms"]:
-        """Each standard error over its coefficient; where that cannot be told from 0, over what would be the whole derivative."""
+        """Relative standard errors of the coefficients.
+
+        A coefficient that cannot be distinguished from 0 is compared with the value at which its term would be the
+        whole derivative.
+        """
         with np.errstate(divide="ignore"):
             relative = self.stderr / np.abs(self.coefficients)
         return np.asarray(np.where(relative <= ROUGH, relative, self.stderr * self.scales))
 
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """The terms that can only be told apart badly from each other: unknown ones whose estimates go together."""
+        """Groups of terms that these samples hardly distinguish: unknown coefficients with correlated estimates."""
         unknown = np.flatnonzero(self.errors > KNOWN)
         error = self.stderr
         linked = np.abs(self.covariance) > TOGETHER * error * error[:, None]
@@ -106,9 +113,13 @@ class Limit:
         return tuple(sorted(groups))
 
     def combination(self, group: Sequence[int]) -> tuple[Float[ndarray, " group"], float, float]:
-        """Give the best known weighted sum of a group's coefficients: its weights (the largest is 1), value and standard error.
+        """Return the best known weighted sum of the coefficients of a group.
 
-        It is the eigenvector of the smallest eigenvalue of the bound, each coefficient measured as its term's share.
+        The weights are the eigenvector of the smallest eigenvalue of the bound, with each coefficient in units of its
+        scale.
+
+        Returns:
+            the weights (the largest is 1), the value of the sum, and its standard error.
         """
         index = np.asarray(group)
         scale = self.scales[index]
@@ -121,7 +132,7 @@ class Limit:
 
     @property
     def verdicts(self) -> tuple[str, ...]:
-        """One sentence a term."""
+        """One sentence per term."""
         member = {term: group for group in self.groups for term in group}
         return tuple(
             (self._sum(member[k]) if error > KNOWN and k in member else "") or self._alone(k, float(error))
@@ -138,7 +149,7 @@ class Limit:
         return f"known {'only ' if error > KNOWN else ''}to {100 * error:.2g} %{what}"
 
     def _sum(self, group: Sequence[int]) -> str:
-        """Say which sum of a group's coefficients is known; empty where none is."""
+        """Describe the sum of the coefficients of a group that is known; empty where none is."""
         weights, value, error = self.combination(group)
         reference = abs(value)
         largest = int(np.argmax(np.abs(weights)))
@@ -159,7 +170,7 @@ class Limit:
         return f"only the sum of coefficients {text} is known, to {100 * share:.2g} %"
 
     def at(self, noise: float) -> Limit:
-        """Give the bound for another noise level; standard errors are in proportion to it.
+        """Return the bound for another noise level; standard errors are proportional to it.
 
         Raises:
             InputError: the level is not a positive number.
@@ -174,14 +185,14 @@ class Limit:
 
 @dataclass(frozen=True)
 class Design:
-    """What a measurement would need for a wanted accuracy, each by itself, the rest as it is.
+    """What a measurement would need for a wanted accuracy; each number holds with everything else as it is.
 
     Attributes:
         target: the wanted E2.
-        relative: E2 at the bound as things are.
+        relative: E2 at the bound of the measurement as it is.
         noise: the largest noise level that allows it.
-        samples: the fewest samples within the same time, or None where more than were tried are needed.
-        span: the shortest record with the same time between samples, or None likewise.
+        samples: the fewest samples within the same time, or None if more are needed than `design` looks at.
+        span: the duration of the shortest record with the same time between samples, or None likewise.
         records: the fewest records like this one, each with noise of its own.
     """
 
@@ -193,75 +204,35 @@ class Design:
     records: int
 
 
-def bound(
-    system: System,
-    library: Library,
-    *,
-    parameters: Mapping[str, float] | None = None,
-    sites: int | None = None,
-    times: Float[ndarray, " time"] | None = None,
-    ends: Ends | None = None,
-    known_ends: bool = True,
-    initial: str | None = None,
-    variations: Sequence[np.random.Generator | None] = (None,),
-    velocities: bool = True,
-    noise: float = 0.01,
-) -> Limit:
-    """Give the bound for samples of a system.
-
-    Args:
-        system: what moves.
-        library: whose coefficients are wanted; the equation must be in its span.
-        parameters: values that differ from the system's defaults.
-        sites: N, the system's own number when None.
-        times: sample times, the paper's 50 when None.
-        ends: the system's own when None.
-        initial: which initial state, the first when None.
-        known_ends: whether the method is told how the chain ends.
-        variations: one trajectory each; a generator varies its initial state.
-        velocities: whether v is seen too (order 2).
-        noise: sigma over the RMS of the field about its mean, for u and v each.
-
-    Raises:
-        InputError: something is unsound, or the equation is outside the library.
-    """
-    chain: Ends = (ends or system.ends) if known_ends else "unknown"
-    data = [
-        simulate(system, parameters=parameters, sites=sites, times=times, ends=ends, initial=initial, variation=draw)
-        for draw in variations
-    ]
-    seen = [replace(one, v=one.v if velocities else None, ends=chain) for one in data]
-    return bound_of(seen, library, system.order, noise=noise)
-
-
 def bound_of(data: Sequence[SimulatedSamples], library: Library, order: int, *, noise: float) -> Limit:
-    """Give the bound for simulated samples, at their truth.
+    """Return the bound for simulated samples, at their truth.
 
     Args:
-        data: what was observed; v counts where it is there, values that are NaN do not.
-        library: whose coefficients are wanted.
+        data: the samples of each trajectory; v counts if it is there, values that are NaN do not count.
+        library: the terms whose coefficients are wanted.
         order: of the time derivative.
         noise: sigma over the RMS of each field about its mean, whatever noise the samples have.
 
     Raises:
-        InputError: the equation is outside the library, or the noise level is no positive number.
+        InputError: the equation is outside the library, or the noise level is not a positive number.
     """
     truth = data[0].truth(library)
     if truth is None:
         raise InputError(
-            f"the equation of {data[0].source} is outside the library {library.name!r}: there are no coefficients to bound"
+            f"the equation of {data[0].source} is outside the library {library.name!r}: "
+            "there are no coefficients to bound"
         )
     motion = [one.exact for one in data if one.exact is not None]
     return bound_along(data, motion, library, order, truth, noise=noise)
 
 
 def bound_of_fit(data: Sequence[Samples], fit: Fit) -> Limit:
-    """Give the bound for measured samples, at a fit of them: along its motion, with its coefficients and its noise.
+    """Return the bound for measured samples, along the motion of a fit, with its coefficients and its noise.
 
-    The noise is what the fit leaves, errors of the model included.
+    The noise is what the fit leaves, including errors of the model.
 
     Raises:
-        InputError: the fit follows no motion.
+        InputError: the fit has no motion.
     """
     if fit.motion is None:
         raise InputError(
@@ -281,71 +252,112 @@ def bound_along(
     noise: float = 0.01,
     sizes: Sequence[float] | None = None,
 ) -> Limit:
-    """Give the bound along trajectories whose exact states are known (simulated or fitted).
+    """Return the bound along trajectories whose exact states are known (simulated or fitted).
 
     Args:
-        data: what was observed: v counts where it is there, values that are NaN do not; with how the chains end.
+        data: the samples of each trajectory: v counts if it is there, values that are NaN do not count; their `ends` is
+            used.
         motion: the states at the same times; v is needed for order 2.
         library: the terms.
         order: of the time derivative.
         coefficients: of the equation that the motion follows.
         noise: sigma over the RMS of each field about its mean.
-        sizes: standard deviation of the noise on each real part of u, and of v, in place of `noise`.
+        sizes: standard deviations of the noise on each real part of u and of v, in place of `noise`.
 
     Raises:
-        InputError: the noise is no positive number, v is not known, or an input is missing.
+        InputError: the noise is not a positive number, v is not known, or an input is missing.
     """
     if sizes is None and not (np.isfinite(noise) and noise > 0):
         raise InputError(f"noise: {noise!r} must be a number above 0 (0.01 for one per cent)")
-    rows, designs, rates, levels = [], [], [], []
-    for one, exact in zip(data, motion, strict=True):
-        if order == 2 and exact.v is None:
-            raise InputError(f"{one.source}: the bound needs the velocities of the exact motion")
-        dynamics = Dynamics(library.terms, order, exact.is_complex, exact.sites, one.ends)
-        drive, splines = _drive(exact, dynamics)
-        force = one.forcing() if library.uses("f") else None
-        stretches = Stretches(dynamics, exact.t[:-1], exact.t[1:], force, drive)
-        nodes = dynamics.pack(exact.u, exact.v)
-        # Per real part; a complex field shares its noise between both.
-        share = np.sqrt(dynamics.parts)
-        weight = np.zeros((len(exact.t), order, dynamics.parts, dynamics.sites))
-        for level, (states, seen) in enumerate([(exact.u, one.u), (exact.v, one.v)][:order]):
-            if seen is None:
-                continue
-            assert states is not None
-            size = noise_size(states, noise) / share if sizes is None else sizes[level]
-            if not (np.isfinite(size) and size > 0 and noise_size(states, 1.0) > 0):
-                raise InputError(f"{one.source}: nothing moves, or nothing is left to noise: there is no bound")
-            weight[:, level] = (np.isfinite(seen) / size)[:, None]
-            if level == 0:
-                levels.append(size * share / noise_size(states, 1.0))
-        accuracy = 1e-6 * float(np.max(np.abs(nodes)))
-        steps = stretches.substeps(coefficients, nodes[:-1], accuracy, splines)
-        found = condense(
-            stretches, stretches.vary(coefficients, nodes[:-1], steps, splines),
-            weight[..., dynamics.moving].reshape(len(weight), -1),
-            edge_weights=weight[..., dynamics.border] if drive is not None else None,
-        )  # fmt: skip
-        rows.append(found.rows)
-        driven = stretches.driven(exact.t, splines)
-        f = None if force is None else force(exact.t)
-        rate, values, _ = dynamics.linear(coefficients, exact.t, nodes, f, driven, derivatives=False)
-        designs.append(np.moveaxis(values, 1, -1).reshape(-1, len(library.terms)))
-        rates.append(rate.reshape(len(rate), order, -1)[:, -1].ravel())
-    design = np.concatenate(designs)
+    pieces = [
+        _along(one, exact, library, order, coefficients, noise if sizes is None else tuple(sizes))
+        for one, exact in zip(data, motion, strict=True)
+    ]
+    design = np.concatenate([one.values for one in pieces])
     columns = np.linalg.norm(design, axis=0)
     columns[columns == 0] = 1.0
     values = np.linalg.svd(design / columns, compute_uv=False)
-    height = np.linalg.norm(np.concatenate(rates))
+    height = np.linalg.norm(np.concatenate([one.rate for one in pieces]))
     return Limit(
-        library, np.asarray(coefficients, dtype=float), _inverse(np.concatenate(rows)), columns / max(height, 1e-300),
-        float(values[0] / max(values[-1], 1e-300)), float(np.mean(levels)), sum(len(one.t) for one in data),
+        library, np.asarray(coefficients, dtype=float), _inverse(np.concatenate([one.rows for one in pieces])),
+        columns / max(height, 1e-300), float(values[0] / max(values[-1], 1e-300)),
+        float(np.mean([one.level for one in pieces])), sum(len(one.t) for one in data),
         max(float(one.t[-1] - one.t[0]) for one in data),
     )  # fmt: skip
 
 
-def _drive(exact: Samples, dynamics: Dynamics) -> tuple[Drive | None, ndarray | None]:
-    """Put splines of one coefficient a sample through the exact motion of the sites without an equation."""
+@dataclass(frozen=True, eq=False)
+class _Along:
+    """What one trajectory contributes to the bound.
+
+    Attributes:
+        rows: derivatives of the samples by the coefficients, in units of the noise, with the start and the drive
+            eliminated.
+        values: of the terms (numbers of the derivative, terms).
+        rate: the derivative of the equation.
+        level: of the noise on u, relative to the RMS of u about its mean.
+    """
+
+    rows: Float[ndarray, "rows terms"]
+    values: Float[ndarray, "numbers terms"]
+    rate: Float[ndarray, " numbers"]
+    level: float
+
+
+def _along(
+    one: Samples, exact: Samples, library: Library, order: int, coefficients: ndarray, noise: float | tuple[float, ...]
+) -> _Along:
+    if order == 2 and exact.v is None:
+        raise InputError(f"{one.source}: the bound needs the velocities of the exact motion")
+    dynamics = Dynamics(library.terms, order, exact.is_complex, exact.sites, one.ends)
+    drive, splines = _drive(exact, dynamics)
+    force = one.forcing() if library.uses("f") else None
+    stretches = Stretches(dynamics, exact.t[:-1], exact.t[1:], force, drive)
+    nodes = dynamics.pack(exact.u, exact.v)
+    weight, level = _weights(one, exact, dynamics, noise)
+    steps = stretches.substeps(coefficients, nodes[:-1], 1e-6 * float(np.max(np.abs(nodes))), splines)
+    found = condense(stretches, stretches.vary(coefficients, nodes[:-1], steps, splines), weight)
+    f = None if force is None else force(exact.t)
+    driven = stretches.driven(exact.t, splines)
+    rate, values, _ = dynamics.linear(coefficients, exact.t, nodes, f, driven, derivatives=False)
+    return _Along(
+        found.rows,
+        np.moveaxis(values, 1, -1).reshape(-1, len(library.terms)),
+        rate.reshape(len(rate), order, -1)[:, -1].ravel(),
+        level,
+    )
+
+
+def _weights(
+    one: Samples, exact: Samples, dynamics: Dynamics, noise: float | tuple[float, ...]
+) -> tuple[Float[ndarray, "time order parts sites"], float]:
+    """Return one over the noise of each observed number, and the noise level of u.
+
+    Args:
+        one: the samples; what is NaN in them weighs nothing.
+        exact: their motion.
+        dynamics: the equation.
+        noise: the noise level, or the standard deviations of the noise on each real part of u and of v.
+    """
+    # A complex field shares its noise between both parts.
+    share = np.sqrt(dynamics.parts)
+    weight = np.zeros((len(exact.t), dynamics.order, dynamics.parts, dynamics.sites))
+    level = 0.0
+    for number, (states, seen) in enumerate([(exact.u, one.u), (exact.v, one.v)][: dynamics.order]):
+        if seen is None:
+            continue
+        assert states is not None
+        size = noise[number] if isinstance(noise, tuple) else noise_size(states, noise) / share
+        if not (np.isfinite(size) and size > 0 and noise_size(states, 1.0) > 0):
+            raise InputError(f"{one.source}: nothing moves, or nothing is left to noise: there is no bound")
+        weight[:, number] = (np.isfinite(seen) / size)[:, None]
+        if number == 0:
+            level = float(size * share / noise_size(states, 1.0))
+    return weight, level
+
+
+def _drive(exact: Samples, dynamics: Dynamics) -> tuple[BSplines | None, ndarray | None]:
+    """Return splines with one coefficient per sample through the exact motion of the sites without an equation."""
     from scipy.interpolate import make_interp_spline
 
     if len(dynamics.border) == 0:
@@ -353,11 +365,11 @@ def _drive(exact: Samples, dynamics: Dynamics) -> tuple[Drive | None, ndarray | 
     if len(exact.t) <= DEGREE:
         raise InputError(f"unknown ends need at least {DEGREE + 1} samples")
     curve = make_interp_spline(exact.t, split_parts(exact.u[:, dynamics.border], dynamics.is_complex), k=DEGREE)
-    return Drive(curve.t, DEGREE), curve.c
+    return BSplines(curve.t, DEGREE), curve.c
 
 
 def _inverse(rows: ndarray) -> ndarray:
-    """(rows^T rows)^-1, very large in directions that the samples do not show at all."""
+    """Return (rows^T rows)^-1, very large in directions that the samples do not show at all."""
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0] = 1.0
     _, values, right = np.linalg.svd(rows / scale, full_matrices=False)
@@ -366,18 +378,19 @@ def _inverse(rows: ndarray) -> ndarray:
 
 
 def design(bound_at: Callable[[int, int], Limit], *, target: float = 0.01, doublings: int = 4) -> Design:
-    """Say what would be needed to know the coefficients to `target`: less noise, more samples, or more of a record.
+    """Return what would be needed to know the coefficients to `target`: less noise, more samples, or a longer record.
 
-    Samples and record are doubled at most `doublings` times; between two doublings log E2 is taken as linear in their log.
+    Samples and record are doubled at most `doublings` times; between two doublings log E2 is taken as linear in their
+    logarithm.
 
     Args:
-        bound_at: gives the bound for so many times as many samples in the same time, and for a record so many times as long;
-            where it cannot, it raises InputError, and the answer is not known.
+        bound_at: function of two factors that returns the bound for as many times more samples in the same time, and
+            for a record as many times longer. It raises InputError where the bound is not known.
         target: the wanted E2.
-        doublings: at most so many.
+        doublings: largest number of doublings.
 
     Raises:
-        InputError: as for `bound`, or the target is not a positive number.
+        InputError: the bound of the data as they are is not known, or the target is not a positive number.
     """
     if not (np.isfinite(target) and target > 0):
         raise InputError(f"target: {target!r} must be a number above 0 (0.01 for one per cent)")
@@ -408,9 +421,9 @@ def design(bound_at: Callable[[int, int], Limit], *, target: float = 0.01, doubl
 
 
 def denser(data: Sequence[Samples], fit: Fit, times: int) -> Limit:
-    """Give the bound of `bound_of_fit` if there had been `times` as many samples of the same motion in the same time.
+    """Return the bound of `bound_of_fit` for `times` as many samples of the same motion in the same time.
 
-    Between the sample times the fitted motion is taken as its spline of degree 5; nothing is missing there.
+    Between the sample times the fitted motion is its spline of degree 5; no value is missing there.
 
     Raises:
         InputError: as for `bound_of_fit`, or there are too few samples for a spline.

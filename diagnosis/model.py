@@ -17,8 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.methods.engine.sensitivity import Factor
-from latticebench.methods.trajectory import Record, Solution, State, approach, guess, maximise, prepare, without_halves
+from latticebench.methods.engine.dynamics import Factor
+from latticebench.methods.engine.record import Record, prepare, without_halves
+from latticebench.methods.engine.shooting import Solution, State, maximise
+from latticebench.methods.engine.starts import approach, guess
 from latticebench.systems.effects import INSTRUMENT, Effect
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples

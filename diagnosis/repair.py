@@ -26,7 +26,7 @@ from latticebench.diagnosis.residual import (
 from latticebench.diagnosis.tangent import Tangent, linearise
 from latticebench.diagnosis.trace import Finding, screen, variance_gain
 from latticebench.diagnosis.ways import SHORTEST_DELAY
-from latticebench.methods.engine.sensitivity import split_parts
+from latticebench.methods.engine.dynamics import split_parts
 from latticebench.methods.method import check_fit
 from latticebench.systems.effects import Effect
 from latticebench.systems.errors import InputError

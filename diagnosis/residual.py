@@ -19,9 +19,10 @@ import numpy as np
 
 from latticebench.diagnosis.model import ACCURACY, Fitted, carried, corrected, refit, rows_of, without
 from latticebench.methods.engine.derivatives import differentiate
-from latticebench.methods.engine.sensitivity import split_parts
-from latticebench.methods.trajectory import guess, maximise, tolerances
-from latticebench.methods.weak import estimate_state
+from latticebench.methods.engine.dynamics import split_parts
+from latticebench.methods.engine.shooting import maximise, tolerances
+from latticebench.methods.engine.spline_state import estimate_state
+from latticebench.methods.engine.starts import guess
 from latticebench.systems.effects import INSTRUMENT
 from latticebench.systems.errors import InputError
 from latticebench.systems.samples import Samples

@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.model import ACCURACY, Fitted, Force, rates, read_term
+from latticebench.methods.engine.record import Record
 from latticebench.methods.engine.sensitivity import Stretches, Transition
-from latticebench.methods.trajectory import Record, tolerances
+from latticebench.methods.engine.shooting import tolerances
 from latticebench.systems.stencil import Ends, evaluate
 from latticebench.systems.terms import Term
 

@@ -18,7 +18,7 @@ from latticebench.bench.trials.faults.setting import Fields, Setting, draw_all, 
 from latticebench.diagnosis.model import Fitted, Model, refit, rounding_error
 from latticebench.diagnosis.tangent import Tangent, linearise
 from latticebench.diagnosis.ways import ways
-from latticebench.methods.trajectory import Solution, State
+from latticebench.methods.engine.shooting import Solution, State
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import System

@@ -1,1 +1,1 @@
-"""What methods share: dynamics with sensitivities, derivatives, regression."""
+"""What methods share: equations with their derivatives, records, shooting, curves, weak form, regression, derivatives."""

@@ -53,9 +53,10 @@ from latticebench.diagnosis import trace
 from latticebench.diagnosis.model import Fitted, Model, first_fit
 from latticebench.diagnosis.tangent import Path, Tangent, forces, linearise, orthonormal
 from latticebench.diagnosis.ways import ways
+from latticebench.methods.engine.errors_in_variables import ROUNDS, estimate
+from latticebench.methods.engine.shooting import Solution, State
+from latticebench.methods.engine.weak_form import ACCURACY, WeakForm, linearised
 from latticebench.methods.method import Smooth, solve
-from latticebench.methods.trajectory import Solution, State
-from latticebench.methods.weak import ACCURACY, Weak, WeakForm, estimate, linearised
 from latticebench.systems.effects import CATALOGUE, INSTRUMENT, find
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import write_text
@@ -141,9 +142,8 @@ def by_trajectory(model: Model, samples: Samples) -> Tangent:
 
 def by_weak(model: Model, samples: Samples) -> Tangent:
     """Return the tangent of the whitened residual of the weak equations; no declared term is dropped."""
-    default = Weak()
-    form = WeakForm(samples, model.declared, model.order, default.half_width, default.power)
-    found = estimate([form], np.ones(len(model.declared.terms), dtype=bool), default.rounds)
+    form = WeakForm(samples, model.declared, model.order)
+    found = estimate([form], np.ones(len(model.declared.terms), dtype=bool), ROUNDS)
     accuracy = ACCURACY * float(np.sqrt(np.mean(form.rows(form.state.seen)[0] ** 2)))
     target, design, _, covariance = linearised(form, found.states[0], found.coefficients, accuracy)
 

@@ -10,13 +10,21 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench import systems
-from latticebench.bench.limit import Limit, bound, bound_along, bound_of, bound_of_fit, denser, design
+from latticebench.bench.limit import Limit, bound_along, bound_of, bound_of_fit, denser, design
 from latticebench.methods.method import solve
 from latticebench.methods.trajectory import Trajectory
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
 from latticebench.systems.simulate import observe, sample_times, simulate
+
+
+def bound(system, terms, *, noise=0.01, velocities=True, known_ends=True, variations=(None,), **options):
+    """The bound for samples of a system, one trajectory per generator that varies the initial state."""
+    ends = system.ends if known_ends else "unknown"
+    data = [simulate(system, variation=draw, **options) for draw in variations]
+    seen = [replace(one, v=one.v if velocities else None, ends=ends) for one in data]
+    return bound_of(seen, terms, system.order, noise=noise)
 
 
 def spread(name, candidates, noise, seeds, velocities):
@@ -89,13 +97,13 @@ def test_a_thousand_sites():
 
 
 def test_sparse_and_dense_algebra_agree(monkeypatch):
-    from latticebench.methods.engine import sensitivity
+    from latticebench.methods.engine import condensing
 
     system = systems.find("phi4")
     one = system.library("lib2")
     usual = bound(system, one)
     unknown = bound(system, one, known_ends=False)
-    monkeypatch.setattr(sensitivity, "MAX_QR_WORK", 0)
+    monkeypatch.setattr(condensing, "MAX_QR_WORK", 0)
     np.testing.assert_allclose(bound(system, one).covariance, usual.covariance, rtol=1e-5)
     np.testing.assert_allclose(bound(system, one, known_ends=False).covariance, unknown.covariance, rtol=1e-4)
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,11 @@ import pytest
 
 from latticebench import systems
 from latticebench.bench.case import run_case
-from latticebench.bench.limit import bound
+from latticebench.bench.limit import bound_of
 from latticebench.bench.run import run
 from latticebench.bench.store import create
 from latticebench.bench.suite import Case, Suite, load
-from latticebench.systems.simulate import sample_times
+from latticebench.systems.simulate import sample_times, simulate
 
 HERE = Path(__file__).parent
 posix = pytest.mark.skipif(os.name != "posix", reason="sends POSIX signals")
@@ -211,7 +212,8 @@ def test_a_noisy_case_holds_its_bound_and_one_without_noise_or_truth_none(tmp_pa
 
     found = run_case(case(known_ends=True), tmp_path)
     system = systems.find("phi4")
-    direct = bound(system, system.library("lib2"), sites=9, times=sample_times(20), noise=0.01)
+    clean = replace(simulate(system, sites=9, times=sample_times(20)), ends=system.ends)
+    direct = bound_of([clean], system.library("lib2"), system.order, noise=0.01)
     assert found["bound"] == pytest.approx(direct.relative, rel=1e-6)
     assert list(found["bounds"].values()) == pytest.approx(list(direct.stderr), rel=1e-6)
     assert tuple(found["verdicts"].values()) == direct.verdicts

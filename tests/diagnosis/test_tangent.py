@@ -11,7 +11,8 @@ from scipy.interpolate import BSpline
 
 from latticebench.diagnosis.model import Change, Fitted, Force, Model
 from latticebench.diagnosis.tangent import by_psi, force_along, linearise, orthonormal
-from latticebench.methods.trajectory import Solution, State, guess
+from latticebench.methods.engine.shooting import Solution, State
+from latticebench.methods.engine.starts import guess
 from latticebench.systems.effects import find
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples

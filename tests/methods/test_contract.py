@@ -10,7 +10,7 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from latticebench import methods, systems
-from latticebench.methods.engine.sensitivity import split_parts
+from latticebench.methods.engine.dynamics import split_parts
 from latticebench.methods.method import Abilities, Fit, Skipped, make, settings, solve
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library

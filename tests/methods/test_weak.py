@@ -1,4 +1,4 @@
-"""The weak form: its integrals, its estimate, its selection and its standard errors."""
+"""The weak form: its estimate, its selection and its standard errors."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import gamma, jv
 
 from latticebench import systems
-from latticebench.methods.engine.regression import Regression
+from latticebench.methods.engine.errors_in_variables import estimate
+from latticebench.methods.engine.weak_form import WeakForm
 from latticebench.methods.method import Fit
-from latticebench.methods.weak import Weak, WeakForm, bumps, estimate, estimate_state, significant
+from latticebench.methods.weak import Weak
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.samples import Samples, SimulatedSamples
@@ -47,89 +47,7 @@ def candidates(name: str, listed: str) -> tuple[Library, np.ndarray, int]:
     return chosen, truth, system.order
 
 
-# Integrals ----------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("power", [4, 12])
-def test_the_test_functions_derivatives_agree_with_those_of_their_polynomial(power: int) -> None:
-    t = np.linspace(-0.5, 2.5, 61)
-    found = bumps(t, np.array([1.0]), 1.25, power)
-    polynomial = np.polynomial.Polynomial([1.0, 0.0, -1.0]) ** power
-    s = (t - 1.0) / 1.25
-    for order in range(3):
-        derivative = polynomial.deriv(order) if order else polynomial
-        expected = np.where(np.abs(s) < 1, derivative(s) / 1.25**order, 0.0)
-        np.testing.assert_allclose(found[order, 0], expected, atol=1e-9 * np.max(np.abs(expected)))
-
-
-def test_the_weak_integrals_of_a_harmonic_oscillator_are_those_of_bessel_functions() -> None:
-    # int (1 - s^2)^p cos(w (c + a s)) a ds = a cos(w c) sqrt(pi) Gamma(p + 1) (2 / (w a))^(p + 1/2) J_{p + 1/2}(w a)
-    w, power = 1.7, 12
-    t = sample_times(200)
-    form = WeakForm(Samples(t, np.cos(w * t)[:, None]), library("one", "u[n]"), 2, 3.5, power)
-    target, design = form.rows(form.state.seen)
-    a = form.support
-    centres = np.linspace(t[0] + a, t[-1] - a, form.count)
-    expected = a * np.cos(w * centres) * np.sqrt(np.pi) * gamma(power + 1) * (2 / (w * a)) ** (power + 0.5)
-    expected = expected * jv(power + 0.5, w * a)
-    size = np.max(np.abs(expected))
-    np.testing.assert_allclose(design[0, :, 0], expected, atol=1e-10 * size)
-    np.testing.assert_allclose(target[0], -(w**2) * expected, atol=1e-9 * size)
-
-
-def test_the_trapezoidal_rule_on_test_functions_converges_faster_than_their_smoothness_lets_expect() -> None:
-    def integral(points: int) -> float:
-        t = np.linspace(-1.0, 1.0, points + 1)
-        return float(np.sum(bumps(t, np.zeros(1), 1.0, 12)[0, 0] * np.exp(t)) * (t[1] - t[0]))
-
-    exact = integral(2000)
-    errors = [abs(integral(points) - exact) for points in (8, 16, 32)]
-    assert errors[1] < 1e-3 * errors[0]
-    assert errors[2] < 1e-12
-
-
-def test_the_residuals_slope_is_its_finite_difference() -> None:
-    terms = library("mine", "u[n+1]; u[n]**3; v[n]; v[n]**2*u[n-1]; cos(t)*u[n]; n*u[n]")
-    samples = seen("phi4", 0.01, count=60, ends="free")
-    form = WeakForm(samples, terms, 2, 3.5, 12)
-    coefficients = np.array([0.3, -1.0, 0.2, 0.5, 0.7, -0.1])
-    w = form.state.seen
-    direction = np.random.default_rng(0).normal(size=w.shape)
-
-    def residual(state: np.ndarray) -> np.ndarray:
-        target, design = form.rows(state)
-        return np.asarray(target - design @ coefficients)
-
-    expected = (residual(w + 1e-4 * direction) - residual(w - 1e-4 * direction)) / 2e-4
-    found = np.zeros_like(expected)
-    for slope in form.slopes(w, coefficients):
-        found[slope.equations] += (slope.matrix @ direction[slope.channel]).reshape(-1, form.count)
-    np.testing.assert_allclose(found, expected, atol=1e-6 * np.max(np.abs(expected)))
-
-
-# The state ----------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("noise", [0.001, 0.05])
-def test_the_noise_is_estimated_to_a_twentieth(noise: float) -> None:
-    clean = motion("phi4")
-    state = estimate_state(seen("phi4", noise), 2)
-    for found, field in zip(state.noise, (clean.u, clean.v), strict=True):
-        assert field is not None
-        assert found == pytest.approx(noise * np.std(field), rel=0.05)
-
-
-def test_a_state_with_gaps_is_uncertain_where_nothing_was_seen() -> None:
-    t = sample_times(100)
-    rng = np.random.default_rng(0)
-    u = (np.sin(t) + 0.01 * rng.normal(size=100))[:, None]
-    u[40:60] = np.nan
-    form = WeakForm(Samples(t, u), library("one", "u[n]"), 2, 3.5, 12)
-    spread = np.linalg.norm(form.value @ form.state.factors[0], axis=1)
-    assert spread[np.argmin(np.abs(form.grid - 5.0))] > 5 * spread[np.argmin(np.abs(form.grid - 2.5))]
-
-
-# Recovery -----------------------------------------------------------------------------------------------------------------
+# Recovery -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -240,7 +158,7 @@ def test_the_cube_keeps_no_bias_of_three_variances() -> None:
     assert abs(np.mean(errors, axis=0)[2]) < 0.25 * 3 * sigma2 * 2
 
 
-# Selection ----------------------------------------------------------------------------------------------------------------
+# Selection ------------------------------------------------------------------------------------------------------------
 
 
 def test_without_selection_every_term_has_a_coefficient_and_an_error() -> None:
@@ -262,14 +180,6 @@ def test_pysindys_optimisers_select_on_the_whitened_rows(optimizer: str, argumen
     assert right
 
 
-def test_a_term_that_explains_nothing_is_taken_away_and_one_that_does_stays() -> None:
-    rng = np.random.default_rng(0)
-    design = rng.normal(size=(500, 4)) * [1.0, 10.0, 1.0, 0.1]
-    target = design @ [1.0, 0.0, 0.0, 5.0] + rng.normal(size=500)
-    kept = significant(Regression(design, target), np.ones(4, dtype=bool), 1.0)
-    assert list(kept) == [True, False, False, True]
-
-
 def test_where_nothing_moves_by_a_term_all_are_dropped_and_the_status_says_so() -> None:
     rng = np.random.default_rng(2)
     # Uniform motion at different speeds: u'' = 0 whatever the library.
@@ -280,7 +190,7 @@ def test_where_nothing_moves_by_a_term_all_are_dropped_and_the_status_says_so() 
     assert "every term was dropped" in fit.status
 
 
-# Limits -------------------------------------------------------------------------------------------------------------------
+# Limits ---------------------------------------------------------------------------------------------------------------
 
 
 def test_too_few_samples_and_sites_never_seen_are_refused_with_the_reason() -> None:
@@ -312,7 +222,7 @@ def test_settings_out_of_range_are_refused(wrong: dict[str, float]) -> None:
         Weak(**wrong).fit([seen("phi4", 0.0, count=50)], candidates("phi4", "lib2")[0], 2, seed=0)  # type: ignore[arg-type]
 
 
-# Standard errors ----------------------------------------------------------------------------------------------------------
+# Standard errors ------------------------------------------------------------------------------------------------------
 
 
 def coverage(name: str, listed: str, noise: float, seeds: int, **changes: object) -> float:

@@ -25,7 +25,7 @@ from latticebench.bench.trials.faults import (
 )
 from latticebench.bench.trials.specimen import make
 from latticebench.diagnosis.model import Model, first_fit
-from latticebench.methods.engine.sensitivity import Dynamics
+from latticebench.methods.engine.dynamics import Dynamics
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library

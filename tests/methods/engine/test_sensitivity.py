@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from latticebench.methods.engine.sensitivity import Dynamics, Stretches
+from latticebench import systems
+from latticebench.methods.engine.dynamics import Dynamics
+from latticebench.methods.engine.sensitivity import Stretches
+from latticebench.systems.simulate import simulate
 from latticebench.systems.terms import Term
 
 SITES = 6
@@ -26,7 +29,7 @@ def laplacian(u, k, ends):
     return neighbour(u, k + 1, ends) + neighbour(u, k - 1, ends) - 2 * u[k]
 
 
-# Terms, and the factor of time of each that has one. The factor of `1+i` acts on the two parts apart, as a known force must.
+# Terms with the factor in time of each. That of `1+i` acts on the two parts separately, as a known force must.
 REAL = {
     "u[n+1]+u[n-1]-2*u[n]": None,
     "u[n]**3": None,
@@ -192,11 +195,55 @@ def test_at_fixed_ends_a_wider_least_reach_changes_nothing():
     )
 
 
-# Dry friction -----------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("name", "candidates"), [("phi4", "lib2"), ("sine-gordon", "lib2"), ("dnls", "four"), ("ginzburg-landau", "four")]
+)
+def test_sensitivities_agree_with_differences_of_another_integrator(name, candidates):
+    system = systems.find(name)
+    one = system.library(candidates)
+    motion = simulate(system, sites=9)
+    truth = system.truth(one, {})
+    dynamics = Dynamics(one.terms, system.order, system.is_complex, 9, system.ends)
+    start = dynamics.pack(motion.exact.u, motion.exact.v)[3]
+    stretches = Stretches(dynamics, np.array([0.0]), np.array([0.4]))
+    found = stretches.vary(truth, start[None], np.array([8]))
+
+    def end(coefficients, state):
+        def rate(t, y):
+            return dynamics.linear(coefficients, np.array([t]), y[None], derivatives=False)[0][0]
+
+        return solve_ivp(rate, (0, 0.4), state, method="Radau", rtol=1e-11, atol=1e-12).y[:, -1]
+
+    step = 1e-4
+    for k in range(len(truth)):
+        shift = step * np.eye(len(truth))[k]
+        expected = (end(truth + shift, start) - end(truth - shift, start)) / (2 * step)
+        np.testing.assert_allclose(found.by_coefficient[0, k], expected, atol=2e-6)
+    for k in (0, dynamics.size // 2, dynamics.size - 1):
+        shift = step * np.eye(dynamics.size)[k]
+        expected = (end(truth, start + shift) - end(truth, start - shift)) / (2 * step)
+        np.testing.assert_allclose(found.by_state[0, k], expected, atol=2e-6)
+
+
+def test_long_chains_are_disturbed_in_groups_with_the_same_result():
+    system = systems.find("phi4")
+    one = system.library("lib2")
+    motion = simulate(system, sites=40)
+    truth = system.truth(one, {})
+    dynamics = Dynamics(one.terms, 2, False, 40, "free")
+    nodes = dynamics.pack(motion.exact.u, motion.exact.v)[:1]
+    stretches = Stretches(dynamics, np.array([0.0]), np.array([0.05]))
+    grouped = stretches.vary(truth, nodes, np.array([1]))
+    assert isinstance(grouped.by_state, list)
+    whole = stretches.vary_in_groups(truth, nodes, np.array([1]), None, 40, 40)
+    np.testing.assert_allclose(grouped.by_state[0].toarray(), whole.by_state[0], atol=1e-9)
+
+
+# Dry friction ---------------------------------------------------------------------------------------------------------
 
 
 def sliding(u, time, stiffness=64.0, friction=0.15):
-    """Where an oscillator with dry friction that is let go at u is after a time, half swing by half swing, and how fast."""
+    """Position and velocity of an oscillator with dry friction, released at u, half swing by half swing."""
     omega = np.sqrt(stiffness)
     rest = friction / stiffness
     while time > np.pi / omega and abs(u) > rest:

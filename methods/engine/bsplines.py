@@ -1,0 +1,66 @@
+"""B-splines in time, and the values and slopes of those that are not zero at a given time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy import ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class BSplines:
+    """A basis of B-splines of one degree.
+
+    Attributes:
+        knots: those at both ends repeated degree + 1 times.
+        degree: of the polynomials.
+    """
+
+    knots: Float[ndarray, " knots"]
+    degree: int
+
+    @property
+    def count(self) -> int:
+        """The number m of B-splines."""
+        return len(self.knots) - self.degree - 1
+
+    def basis(
+        self, t: Float[ndarray, " time"]
+    ) -> tuple[Int[ndarray, " time"], Float[ndarray, "time local"], Float[ndarray, "time local"]]:
+        """Evaluate the degree + 1 consecutive B-splines that are not zero at each time.
+
+        Returns:
+            the index of the first of them, their values, and their slopes (1 over time).
+        """
+        degree = self.degree
+        span = np.clip(np.searchsorted(self.knots, t, side="right") - 1, degree, self.count - 1)
+        # Cox and de Boor's recursion, one degree at a time; `lower` keeps the last but one for the slopes.
+        value = np.ones((len(t), 1))
+        lower = value
+        for d in range(1, degree + 1):
+            lower = value
+            value = np.zeros((len(t), d + 1))
+            for j in range(d):
+                left = self.knots[span + j + 1 - d]
+                right = self.knots[span + j + 1]
+                share = lower[:, j] / (right - left)
+                value[:, j] += share * (right - t)
+                value[:, j + 1] += share * (t - left)
+        slope = np.zeros((len(t), degree + 1))
+        for j in range(degree):
+            share = degree * lower[:, j] / (self.knots[span + j + 1] - self.knots[span + j + 1 - degree])
+            slope[:, j] -= share
+            slope[:, j + 1] += share
+        return span - degree, value, slope
+
+    def design(self, t: Float[ndarray, " time"], derivative: int) -> Float[ndarray, "time splines"]:
+        """Return the values (`derivative` 0) or slopes (1) of all B-splines as a matrix."""
+        first, *curves = self.basis(t)
+        dense = np.zeros((len(t), self.count))
+        dense[np.arange(len(t))[:, None], first[:, None] + np.arange(self.degree + 1)] = curves[derivative]
+        return dense

@@ -1,0 +1,336 @@
+"""Linearised least squares along a trajectory, with all states but the coefficients eliminated.
+
+The states at the sample times are unknowns of a least-squares problem, tied to each other by the motion between them.
+About given states the problem is linear: all states but the first are eliminated along the motion, then the first state
+and the motion at unknown ends. What remains is least squares for the coefficients alone (Bock, Springer Ser. Chem.
+Phys. 18, 102 (1981)). Fits of whole trajectories and the statistical limit both use it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from latticebench.methods.engine.sensitivity import CHUNK, TAIL, Stretches, Transition
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy import ndarray
+
+# Up to this many operations the problem is solved by orthogonal factors, beyond by normal equations.
+MAX_QR_WORK = 6e9
+
+
+@dataclass(frozen=True, eq=False)
+class Condensed:
+    """What the samples of one trajectory say about the coefficients, with its start and drive unknown.
+
+    Attributes:
+        rows, target: least squares for a change of the coefficients, rows @ change = target, in units of the noise.
+        own: function that maps a change of the coefficients to the change of the start (S,) and of the splines of the
+            drive (m * parts * border,) that goes with it.
+        transition, defects, stretches: see `condense`.
+    """
+
+    rows: Float[ndarray, "rows terms"]
+    target: Float[ndarray, " rows"]
+    own: Callable[[ndarray], tuple[ndarray, ndarray]]
+    transition: Transition
+    defects: Float[ndarray, "stretch state"]
+    stretches: Stretches
+
+    def moves(self, change: Float[ndarray, " terms"]) -> tuple[Float[ndarray, "time state"], ndarray]:
+        """Return the changes of all states (K + 1, S) and of the splines (m, parts, border) that go with `change`."""
+        start, splines = self.own(change)
+        moved = np.empty((len(self.defects) + 1, len(start)))
+        moved[0] = start
+        shared = np.tensordot(self.transition.by_coefficient, change, (1, 0)) + self.defects
+        if len(splines):
+            assert self.transition.by_drive is not None
+            local = _local_columns(self.stretches, self.transition)
+            shared = shared + np.einsum("kq,kqs->ks", splines[local], self.transition.by_drive)
+        for k, forced in enumerate(shared):
+            moved[k + 1] = moved[k] @ self.transition.by_state[k] + forced
+        dynamics = self.stretches.dynamics
+        each = max(dynamics.parts * len(dynamics.border), 1)
+        return moved, splines.reshape(len(splines) // each, dynamics.parts, len(dynamics.border))
+
+
+def _local_columns(stretches: Stretches, transition: Transition) -> Int[ndarray, "stretch local"]:
+    """Return which of all spline coefficients act in each stretch (K, Q)."""
+    assert transition.by_drive is not None
+    assert transition.first is not None
+    width = transition.by_drive.shape[1]
+    each = stretches.dynamics.parts * len(stretches.dynamics.border)
+    return np.asarray(transition.first[:, None] * each + np.arange(width))
+
+
+def condense(
+    stretches: Stretches,
+    transition: Transition,
+    weights: Float[ndarray, "time order parts sites"],
+    residuals: Float[ndarray, "time order parts sites"] | None = None,
+    defects: Float[ndarray, "stretch state"] | None = None,
+) -> Condensed:
+    """Eliminate all states but the first, and then the start and the drive, from the linearised least squares.
+
+    Minimises sum (weights * (residuals - change of state))^2 over the changes that follow
+    change_{k+1} = (d end / d start) change_k + (d end / d xi) change of xi + defects_k.
+
+    Args:
+        stretches: between K + 1 sample times.
+        transition: their ends with derivatives.
+        weights: one over the noise of each observed number, 0 where nothing was seen (K + 1, order, parts, N).
+        residuals: observed minus present values, likewise; None for 0.
+        defects: end of each stretch minus the next state; None for 0.
+    """
+    dynamics = stretches.dynamics
+    size, terms = dynamics.size, transition.by_coefficient.shape[1]
+    count = len(transition.end)
+    residuals = np.zeros_like(weights) if residuals is None else residuals
+    defects = np.zeros((count, size)) if defects is None else defects
+    edge = _edge_rows(stretches, weights[..., dynamics.border], residuals[..., dynamics.border])
+    own = dynamics.moving
+    weights, residuals = (one[..., own].reshape(count + 1, size) for one in (weights, residuals))
+    splines = edge.shape[1] - 1 if edge is not None else 0
+    columns = size + splines + terms
+    sparse = isinstance(transition.by_state, Sequence) and size > 300
+    if not sparse and (count + 1) * size * columns**2 < MAX_QR_WORK:
+        sums: Any = _Triangle(columns)
+    else:
+        sums = _Squares(size, columns, sparse)
+    if edge is not None:
+        wide = np.zeros((len(edge), columns + 1))
+        wide[:, size : size + splines] = edge[:, :-1]
+        wide[:, -1] = edge[:, -1]
+        sums.add_rows(wide)
+    local = _local_columns(stretches, transition) if splines else None
+    if isinstance(sums, _Triangle):
+        _gather(sums, transition, weights, residuals, defects, splines, local)
+    else:
+        _square(sums, transition, weights, residuals, defects, splines, local)
+    rows, target, solve = sums.reduce(terms)
+
+    def start_and_drive(change: ndarray) -> tuple[ndarray, ndarray]:
+        found = solve(change)
+        return found[:size], found[size:]
+
+    return Condensed(rows, target, start_and_drive, transition, defects, stretches)
+
+
+def _gather(
+    sums: _Triangle,
+    transition: Transition,
+    weights: ndarray,
+    residuals: ndarray,
+    defects: ndarray,
+    splines: int,
+    local: ndarray | None,
+) -> None:
+    """Follow the effects of the start, the drive, the coefficients and (last row) the defects.
+
+    The rows of many sample times are collected at once.
+    """
+    count, size = defects.shape
+    z = np.zeros((sums.columns + 1, size))
+    z[:size] = np.eye(size)
+    block = max(1, CHUNK // z.size)
+    kept = np.empty((min(block, count + 1), *z.shape))
+    for k in range(count + 1):
+        number = k % block
+        kept[number] = z
+        if number == block - 1 or k == count:
+            now = slice(k - number, k + 1)
+            sums.add(kept[: number + 1], weights[now], residuals[now])
+        if k == count:
+            break
+        z = z @ transition.by_state[k]
+        z[size + splines : -1] += transition.by_coefficient[k]
+        z[-1] += defects[k]
+        if local is not None:
+            assert transition.by_drive is not None
+            z[size + local[k]] += transition.by_drive[k]
+
+
+def _square(
+    sums: _Squares,
+    transition: Transition,
+    weights: ndarray,
+    residuals: ndarray,
+    defects: ndarray,
+    splines: int,
+    local: ndarray | None,
+) -> None:
+    """Follow the same effects for normal equations, one time after another."""
+    count, size = defects.shape
+    state: Any = np.eye(size)
+    if sums.sparse:
+        import scipy.sparse
+
+        state = scipy.sparse.csr_array(scipy.sparse.identity(size, format="csr"))
+    other = np.zeros((sums.columns + 1 - size, size))
+    for k in range(count + 1):
+        # The last row of `other` is the effect of the defects.
+        sums.add(state, other, weights[k], residuals[k])
+        if k == count:
+            break
+        through = transition.by_state[k]
+        state = state @ through
+        other = other @ through
+        other[splines:-1] += transition.by_coefficient[k]
+        other[-1] += defects[k]
+        if local is not None:
+            assert transition.by_drive is not None
+            other[local[k]] += transition.by_drive[k]
+        if sums.sparse:
+            state.data[np.abs(state.data) < TAIL * 1e-3 * np.max(np.abs(state.data))] = 0.0
+            state.eliminate_zeros()
+
+
+def _edge_rows(stretches: Stretches, weights: ndarray, residuals: ndarray) -> ndarray | None:
+    """Return rows that hold the drive to the samples of its sites; the last column is the target."""
+    if stretches.drive is None or stretches.held:
+        return None
+    dynamics, drive = stretches.dynamics, stretches.drive
+    times = np.append(stretches.begin, stretches.end[-1])
+    first, *curves = drive.basis(times)
+    each = dynamics.parts * len(dynamics.border)
+    place = first[:, None] + np.arange(drive.degree + 1)
+    blocks = []
+    for level in range(dynamics.order):
+        for number in range(each):
+            part, site = divmod(number, len(dynamics.border))
+            weight = weights[:, level, part, site]
+            seen = np.flatnonzero(weight > 0)
+            block = np.zeros((len(seen), drive.count * each + 1))
+            block[np.arange(len(seen))[:, None], place[seen] * each + number] = curves[level][seen] * weight[seen, None]
+            block[:, -1] = residuals[seen, level, part, site] * weight[seen]
+            blocks.append(block)
+    return np.concatenate(blocks)
+
+
+def _triangular(rows: ndarray) -> ndarray:
+    """Return the factor R of rows = Q R."""
+    factor: Any = np.linalg.qr(rows, mode="r")
+    return np.asarray(factor)
+
+
+class _Triangle:
+    """Rows of a least-squares problem, kept as their triangular factor R."""
+
+    def __init__(self, columns: int) -> None:
+        self.columns = columns
+        self.kept: list[ndarray] = []
+        self.waiting = 0
+
+    def add_rows(self, rows: ndarray) -> None:
+        self.kept.append(rows)
+        self.waiting += len(rows)
+        if self.waiting > 6 * self.columns:
+            self.kept = [_triangular(np.concatenate(self.kept))]
+            self.waiting = len(self.kept[0])
+
+    def add(self, z: ndarray, weights: ndarray, residuals: ndarray) -> None:
+        """Add the samples at B times: z (B, columns + 1, S), weights and residuals (B, S)."""
+        rows = np.moveaxis(z, 1, 2).copy()
+        rows[..., -1] = residuals - rows[..., -1]
+        rows *= weights[..., None]
+        seen = weights > 0
+        if np.any(seen):
+            self.add_rows(rows[seen])
+
+    def reduce(self, terms: int) -> tuple[ndarray, ndarray, Callable[[ndarray], ndarray]]:
+        from scipy.linalg import solve_triangular
+
+        own = self.columns - terms
+        rows = np.concatenate(self.kept)
+        scale = np.linalg.norm(rows[:, :-1], axis=0)
+        scale[scale == 0] = 1.0
+        # What the samples do not determine at all stays where it is.
+        ridge = np.zeros((own, self.columns + 1))
+        ridge[np.arange(own), np.arange(own)] = 1e-9 * scale[:own]
+        factor = _triangular(np.concatenate([rows, ridge]))
+        upper, coupled, aim = factor[:own, :own], factor[:own, own:-1], factor[:own, -1]
+
+        def solve(change: ndarray) -> ndarray:
+            return np.asarray(solve_triangular(upper, aim - coupled @ change))
+
+        return factor[own:, own:-1], factor[own:, -1], solve
+
+
+class _Squares:
+    """The same problem as normal equations; the block of the states is sparse for long chains."""
+
+    def __init__(self, size: int, columns: int, sparse: bool) -> None:
+        self.size, self.columns, self.sparse = size, columns, sparse
+        self.block: Any = np.zeros((size, size))
+        if sparse:
+            import scipy.sparse
+
+            self.block = scipy.sparse.csr_array((size, size))
+        self.across = np.zeros((size, columns - size + 1))
+        self.rest = np.zeros((columns - size + 1, columns - size + 1))
+
+    def add_rows(self, rows: ndarray) -> None:
+        tail = rows[:, self.size :]
+        self.rest += tail.T @ tail
+
+    def add(self, state: Any, other: ndarray, weights: ndarray, residuals: ndarray) -> None:
+        tail = other.copy()
+        tail[-1] = residuals - tail[-1]
+        tail *= weights
+        if self.sparse:
+            import scipy.sparse
+
+            weighted = state @ scipy.sparse.diags_array(weights, format="csr")
+        else:
+            weighted = state * weights
+        self.block = self.block + weighted @ weighted.T
+        self.across += weighted @ tail.T
+        self.rest += tail @ tail.T
+
+    def reduce(self, terms: int) -> tuple[ndarray, ndarray, Callable[[ndarray], ndarray]]:
+        import scipy.linalg
+        import scipy.sparse.linalg
+
+        diagonal = self.block.diagonal()
+        ridge = 1e-14 * np.where(diagonal > 0, diagonal, 1.0)
+        if self.sparse:
+            import scipy.sparse
+
+            matrix = scipy.sparse.csc_array(self.block + scipy.sparse.diags_array(ridge))
+            divide = scipy.sparse.linalg.splu(
+                matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            ).solve
+        else:
+            factor = scipy.linalg.cho_factor(self.block + np.diag(ridge))
+
+            def divide(right: ndarray) -> ndarray:
+                return np.asarray(scipy.linalg.cho_solve(factor, right))
+
+        solved = divide(self.across)
+        left = self.rest - self.across.T @ solved
+        left = (left + left.T) / 2
+        # Then the drive is eliminated; what remains concerns the coefficients.
+        drive = len(left) - 1 - terms
+        inner = np.zeros((drive, terms + 1))
+        if drive:
+            held = np.diag(left)[:drive]
+            near = left[:drive, :drive] + np.diag(1e-14 * np.where(held > 0, held, 1.0))
+            inner = scipy.linalg.solve(near, left[:drive, drive:], assume_a="pos")
+            left = left[drive:, drive:] - left[drive:, :drive] @ inner
+        scale = np.sqrt(np.maximum(np.diag(left)[:-1], 1e-300))
+        values, vectors = np.linalg.eigh(left[:-1, :-1] / scale / scale[:, None])
+        root = np.sqrt(np.maximum(values, 0.0))
+        rows = root[:, None] * vectors.T * scale
+        target = np.where(root > 1e-8, vectors.T @ (left[:-1, -1] / scale) / np.maximum(root, 1e-8), 0.0)
+
+        def solve(change: ndarray) -> ndarray:
+            splines = inner[:, -1] - inner[:, :-1] @ change
+            start = solved[:, -1] - solved[:, :-1] @ np.concatenate([splines, change])
+            return np.concatenate([start, splines])
+
+        return rows, target, solve

@@ -1,0 +1,279 @@
+"""The equation of motion on a chain, evaluated for many states at once, with its derivatives by the state.
+
+    d^order u_n / dt^order = sum_j xi_j w_jn g_jn(t) T_j
+
+The right-hand side is linear in the coefficients xi, so the values of the terms are its derivatives by them. The
+derivatives by the state come from the term language and are exact.
+
+Dry friction, sign(v), jumps where a site turns round and holds a site that is at rest. It counts as its mean over one
+step of the integrator (`Dynamics.linear`), so that it can be integrated and derived; the mean becomes the jump as the
+steps get shorter.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from latticebench.systems.compiler import Slot, compiled, partials
+from latticebench.systems.errors import InputError
+from latticebench.systems.stencil import Ends, ghosts, observed
+from latticebench.systems.terms import Term
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy import ndarray
+
+Factor = Callable[["ndarray"], "ndarray"]
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """The equation of motion of a chain.
+
+    A state consists of S = order * parts * M numbers: u, or Re u and Im u, of the M sites that have an equation and,
+    for order 2, their velocities likewise. All N sites have an equation unless the ends are unknown; then only those do
+    whose whole stencil lies inside the chain.
+
+    Attributes:
+        terms: T_j.
+        order: 1 or 2.
+        is_complex: whether u is complex.
+        sites: N.
+        ends: how the chain ends.
+        weights: w_jn (terms, N); None for 1 everywhere. A row with a single 1 and zeros makes a term act at one site.
+        factors: g_jn of each term, None for 1: a function that maps times (B,) to an array that broadcasts to
+            (parts, B, N). The term 1 (1+i for a complex field) with a factor is an arbitrary known force.
+        least_reach: least width of the stencil to the left and to the right. With it, equations of different terms
+            leave the same sites without an equation at unknown ends.
+    """
+
+    terms: tuple[Term, ...]
+    order: int
+    is_complex: bool
+    sites: int
+    ends: Ends
+    weights: Float[ndarray, "terms sites"] | None = None
+    factors: tuple[Factor | None, ...] | None = None
+    least_reach: tuple[int, int] = (0, 0)
+
+    @functools.cached_property
+    def reach(self) -> tuple[int, int]:
+        """The number of neighbours to the left and to the right in the widest stencil."""
+        left, right = self.least_reach
+        return max(left, *(term.reach[0] for term in self.terms)), max(right, *(term.reach[1] for term in self.terms))
+
+    @property
+    def parts(self) -> int:
+        """1 for a real field, 2 for a complex one."""
+        return 1 + self.is_complex
+
+    @functools.cached_property
+    def moving(self) -> slice:
+        """The sites that have an equation."""
+        return observed(self.sites, self.reach, self.ends)
+
+    @functools.cached_property
+    def count(self) -> int:
+        """The number M of sites that have an equation."""
+        return len(range(*self.moving.indices(self.sites)))
+
+    @property
+    def size(self) -> int:
+        """The length S of a state."""
+        return self.order * self.parts * self.count
+
+    @functools.cached_property
+    def border(self) -> Int[ndarray, " border"]:
+        """The sites that have no equation."""
+        return np.setdiff1d(np.arange(self.sites), np.arange(self.sites)[self.moving])
+
+    def pack(self, u: ndarray, v: ndarray | None) -> Float[ndarray, "time state"]:
+        """Write u (T, N) and, for order 2, v (T, N) as states; a v that is None counts as zero."""
+        fields = [u] if self.order == 1 else [u, np.zeros_like(u) if v is None else v]
+        blocks = [split_parts(one[:, self.moving], self.is_complex) for one in fields]
+        return np.stack(blocks, axis=1).reshape(len(u), self.size)
+
+    def linear(
+        self,
+        coefficients: Float[ndarray, " terms"],
+        t: Float[ndarray, " batch"],
+        y: Float[ndarray, "batch state"],
+        f: Float[ndarray, "batch sites"] | None = None,
+        driven: Float[ndarray, "batch order parts border"] | None = None,
+        *,
+        derivatives: bool = True,
+        step: Float[ndarray, " batch"] | None = None,
+    ) -> tuple[ndarray, ndarray, dict[tuple[int, Slot], ndarray]]:
+        """Evaluate the right-hand side and its derivatives.
+
+        For steps of length h, the term sign(v[n]) is replaced by tanh(2 v / (h b)), where b is the larger of the
+        acceleration by all other terms and of the friction's own. Where a site turns round, this is about the mean of
+        sign(v) over the step. Where a site is at rest, it is a friction that stops the site within a step and holds it
+        against any smaller acceleration (as in Moreau's time stepping, Nonsmooth Mechanics and Applications (1988)).
+        Derivatives keep b fixed.
+
+        Args:
+            coefficients: xi.
+            t: times (B,).
+            y: states.
+            f: measured input at all sites; needed if a term uses it.
+            driven: u and, for order 2, v of the sites that have no equation.
+            derivatives: whether the derivatives by the state are wanted.
+            step: length h of the integrator's step for each state; None leaves sign(v[n]) as it is.
+
+        Returns:
+            dy/dt (B, S); the values of the terms with their weights and factors (parts, terms, B, M); for each part of
+            the equation and each variable of the stencil, the derivative of the highest time derivative (B, M). The
+            last is empty without `derivatives`.
+
+        Raises:
+            InputError: a term uses f[n], and there is no input.
+        """
+        windows = self._windows(y, t, f, driven)
+        bundle = self._values
+        shape = (len(t), self.count)
+        values = np.empty((self.parts, len(self.terms), *shape))
+        flat = values.reshape(-1, *shape)
+        for k, value in enumerate(bundle.function(*(windows(slot) for slot in bundle.slots))):
+            flat[k] = value
+        if self.weights is not None:
+            values *= self.weights[:, None, self.moving]
+        factors = self._factors(t)
+        for term, factor in factors.items():
+            values[:, term] *= factor
+        found: dict[tuple[int, Slot], ndarray] = {}
+        rate = np.empty((len(t), self.order, self.parts, self.count))
+        if self.order == 2:
+            rate[:, 0] = y.reshape(rate.shape)[:, 1]
+        if step is not None and self._rubbing:
+            found = self._softened(coefficients, values, rate[:, 0, 0], step, factors, derivatives)
+        rate[:, -1] = np.moveaxis(np.tensordot(coefficients, values, (0, 1)), 0, 1)
+        if derivatives:
+            self._add_slopes(found, windows, coefficients, factors)
+        return rate.reshape(y.shape), values, found
+
+    def _add_slopes(
+        self,
+        found: dict[tuple[int, Slot], ndarray],
+        windows: Callable[[Slot], Any],
+        coefficients: ndarray,
+        factors: dict[int, ndarray],
+    ) -> None:
+        """Add to `found` the derivatives of all terms by the variables of the stencil, times their coefficients."""
+        slopes, places = self._partials
+        outputs = slopes.function(*(windows(slot) for slot in slopes.slots)) if places else ()
+        for (term, part, slot), value in zip(places, outputs, strict=True):
+            share = coefficients[term] * value
+            if self.weights is not None:
+                share = share * self.weights[term, self.moving]
+            if term in factors:
+                share = share * factors[term][part]
+            found[part, slot] = found[part, slot] + share if (part, slot) in found else share
+
+    @functools.cached_property
+    def _rubbing(self) -> tuple[int, ...]:
+        """The numbers of the terms that are dry friction."""
+        if self.order == 1 or self.is_complex:
+            return ()
+        return tuple(k for k, term in enumerate(self.terms) if term.jumps)
+
+    def _softened(
+        self,
+        coefficients: ndarray,
+        values: ndarray,
+        v: ndarray,
+        step: ndarray,
+        factors: dict[int, ndarray],
+        derivatives: bool,
+    ) -> dict[tuple[int, Slot], ndarray]:
+        """Replace dry friction in `values` by its mean over a step, and return its derivative by v."""
+        others = np.delete(np.arange(len(self.terms)), self._rubbing)
+        push = np.abs(np.tensordot(coefficients[others], values[0, others], (0, 0)))
+        total = np.zeros_like(v)
+        for term in self._rubbing:
+            size = np.ones_like(v) if self.weights is None else self.weights[term, self.moving] * np.ones_like(v)
+            if term in factors:
+                size = size * factors[term][0]
+            width = np.maximum(
+                step[:, None] / 2 * np.maximum(push, np.abs(coefficients[term] * size)), np.finfo(float).tiny
+            )
+            soft = np.tanh(v / width)
+            values[0, term] = size * soft
+            if derivatives:
+                total += coefficients[term] * size * (1 - soft**2) / width
+        return {(0, Slot("v", 0, "re")): total} if derivatives else {}
+
+    def _factors(self, t: ndarray) -> dict[int, ndarray]:
+        """Evaluate the factors at the sites that have an equation; each is (parts, B, M)."""
+        found = {}
+        for term, factor in enumerate(self.factors or ()):
+            if factor is not None:
+                whole = np.broadcast_to(factor(t), (self.parts, len(t), self.sites))
+                found[term] = whole[..., self.moving]
+        return found
+
+    @functools.cached_property
+    def _values(self) -> Any:
+        return compiled(tuple(term.text for term in self.terms), self.is_complex)
+
+    @functools.cached_property
+    def _partials(self) -> Any:
+        return partials(tuple(term.text for term in self.terms), self.is_complex)
+
+    @functools.cached_property
+    def ghosts(self) -> tuple[Int[ndarray, " padded"], Float[ndarray, " padded"]]:
+        """The site that each place of the padded chain repeats, and the factor that it is multiplied by."""
+        return ghosts(self.sites, *self.reach, self.ends)
+
+    @functools.cached_property
+    def _ghosts_are_copies(self) -> bool:
+        return bool(np.all(self.ghosts[1] == 1))
+
+    def padded(self, field: ndarray) -> ndarray:
+        """Extend the last axis, the N sites, by what the ends repeat."""
+        index, factor = self.ghosts
+        if self.ends != "unknown":
+            field = np.take(field, index, axis=-1)
+        return field if self._ghosts_are_copies else field * factor
+
+    def whole(self, y: ndarray, driven: ndarray | None) -> ndarray:
+        """Return the fields of all sites (..., order, parts, N); the border is 0 where `driven` is None."""
+        blocks = y.reshape(*y.shape[:-1], self.order, self.parts, self.count)
+        if len(self.border) == 0:
+            return blocks
+        left = self.reach[0]
+        whole = np.zeros((*blocks.shape[:-1], self.sites))
+        whole[..., self.moving] = blocks
+        if driven is not None:
+            whole[..., :left] = driven[..., :left]
+            whole[..., self.moving.stop :] = driven[..., left:]
+        return whole
+
+    def _windows(self, y: ndarray, t: ndarray, f: ndarray | None, driven: ndarray | None) -> Callable[[Slot], Any]:
+        fields = self.padded(self.whole(y, driven))
+        force = None if f is None else self.padded(f)
+        n = (np.arange(self.sites) - (self.sites - 1) / 2)[self.moving]
+
+        def window(slot: Slot) -> Any:
+            first = self.reach[0] + slot.offset
+            if slot.name == "t":
+                return t[:, None]
+            if slot.name == "n":
+                return n
+            if slot.name == "f":
+                if force is None:
+                    raise InputError("the terms use f[n], but there is no measured input")
+                return force[:, first : first + self.count]
+            return fields[:, int(slot.name == "v"), int(slot.part == "im"), first : first + self.count]
+
+        return window
+
+
+def split_parts(field: ndarray, is_complex: bool) -> Float[ndarray, "time parts sites"]:
+    """Write a field (T, N) as its real part and, for a complex field, its imaginary part."""
+    return np.stack([field.real, field.imag] if is_complex else [field], axis=1).astype(float)

@@ -1,0 +1,282 @@
+"""Generalised least squares for the weak form, with errors in the variables, and the selection of terms.
+
+The weak equations are whitened by the covariance of their residual (`latticebench.methods.engine.weak_form`).
+Generalised least squares then gives the coefficients, and the same algebra gives the nearest state that obeys the weak
+equations; there the terms are evaluated again, until nothing changes. This is Gauss-Newton for maximum likelihood with
+errors in the variables (Britt & Luecke, Technometrics 15, 233 (1973)). It removes the bias that noise causes in plain
+least squares, such as 3 sigma^2 u in u^3.
+
+Terms are selected on the whitened rows: the least significant term is removed, again and again, and the extended
+Bayesian information criterion (Chen & Chen, Biometrika 95, 759 (2008)) decides how many stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.methods.engine.regression import Regression
+from latticebench.methods.engine.weak_form import ACCURACY, WeakForm, linearised
+from latticebench.systems.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+    from numpy import ndarray
+
+# Largest number of times that the terms are evaluated anew.
+ROUNDS = 20
+# Draws of the noise for total least squares, and the mean square residual above which it is used.
+DRAWS = 10
+SUSPECT = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Coefficients by generalised least squares, with the rows that they come from and the states that go with them.
+
+    Attributes:
+        coefficients: (terms,); 0 outside the support.
+        stderr: their standard errors, widened where the residual is larger than the noise explains.
+        regression: the whitened rows of all terms.
+        chi2: mean square of the whitened residual, about 1 when the equation holds and the noise is known.
+        states: w of each trajectory.
+        rounds: how many times the terms were evaluated.
+        settled: whether the coefficients stopped changing.
+    """
+
+    coefficients: Float[ndarray, " terms"]
+    stderr: Float[ndarray, " terms"]
+    regression: Regression
+    chi2: float
+    states: tuple[Float[ndarray, "channels coefficients"], ...]
+    rounds: int
+    settled: bool
+
+
+def estimate(
+    forms: Sequence[WeakForm],
+    support: Bool[ndarray, " terms"],
+    rounds: int,
+    start: Estimate | None = None,
+    seed: int = 0,
+) -> Estimate:
+    """Alternate between the coefficients of the terms in `support` and the states until neither changes.
+
+    Without `start`, the iteration begins with ordinary least squares and, where that fails because noise pulls it to
+    zero, with total least squares. The iteration that settles is kept; of two that settle, the one whose residual the
+    noise explains better.
+
+    Args:
+        forms: the weak equations of each trajectory.
+        support: which terms are fitted.
+        rounds: largest number of times that the terms are evaluated.
+        start: an estimate to begin with.
+        seed: of the draws from which total least squares takes the noise of the rows.
+
+    Raises:
+        InputError: the covariance is not positive, or the terms overflow.
+    """
+    if start is not None:
+        return _iterate(forms, support, rounds, np.where(support, start.coefficients, 0.0), start.states)
+    seen = tuple(form.state.seen for form in forms)
+    rows = np.concatenate([_joined(form, form.state.seen) for form in forms])
+    found = _iterate(forms, support, rounds, Regression(rows[:, :-1], rows[:, -1]).least_squares(support), seen)
+    if found.settled and found.chi2 < SUSPECT:
+        return found
+    first = _total(forms, support, seed)
+    if first is None:
+        return found
+    other = _iterate(forms, support, rounds, first, seen)
+    return max(found, other, key=lambda one: (one.settled, -abs(np.log(max(one.chi2, 1e-300)))))
+
+
+def _iterate(
+    forms: Sequence[WeakForm], support: ndarray, rounds: int, coefficients: ndarray, states: Sequence[ndarray]
+) -> Estimate:
+    target = np.concatenate([form.rows(form.state.seen)[0].ravel() for form in forms])
+    accuracy = ACCURACY * (float(np.sqrt(np.mean(target**2))) or 1.0)
+    best: Estimate | None = None
+    for number in range(1, rounds + 1):
+        try:
+            now = _round(forms, support, coefficients, states, accuracy, number)
+        except (np.linalg.LinAlgError, FloatingPointError) as error:
+            if best is None:
+                raise InputError(f"{forms[0].samples.source}: the weak form fails: {error}") from error
+            return best
+        step = np.abs(now.coefficients - coefficients)
+        tolerance = np.maximum(0.01 * now.stderr, 1e-13 * np.max(np.abs(now.coefficients), initial=0.0))
+        # The last estimate is kept, unless the iteration ran away from a better one.
+        if best is None or now.chi2 <= 1.2 * best.chi2:
+            best = now
+        if np.all(step <= tolerance):
+            return replace(best, settled=True)
+        coefficients, states = now.coefficients, now.states
+    assert best is not None
+    return best
+
+
+def _total(forms: Sequence[WeakForm], support: ndarray, seed: int) -> ndarray | None:
+    """Return the coefficients by total least squares; None where it has no finite solution.
+
+    Noise in the terms pulls ordinary least squares towards zero, but not total least squares, which makes [A,
+    y] (xi, -1) small against the contribution of the noise: the least generalised eigenvalue of the two
+    matrices of sums of squares. That of the noise is taken from a few draws (Van Huffel & Vandewalle, The Total
+    Least Squares Problem, SIAM 1991, chapter 8).
+    """
+    import scipy.linalg
+
+    draw = np.random.default_rng(seed)
+    columns = np.append(np.flatnonzero(support), len(support))
+    parts, changes = [], []
+    for form in forms:
+        seen = _joined(form, form.state.seen)[:, columns]
+        parts.append(seen)
+        for _ in range(DRAWS):
+            noisy = form.state.seen + draw.normal(size=form.state.seen.shape)
+            changes.append(_joined(form, noisy)[:, columns] - seen)
+    rows, noise = np.concatenate(parts), np.concatenate(changes)
+    scale = np.linalg.norm(rows, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    try:
+        gram = (noise / scale).T @ (noise / scale) / DRAWS
+        _, modes = scipy.linalg.eigh((rows / scale).T @ (rows / scale), gram, subset_by_index=[0, 0])
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    least = modes[:, 0] / scale
+    if abs(modes[-1, 0]) < 1e-6 * np.max(np.abs(modes)):
+        return None
+    full = np.zeros(len(support))
+    full[columns[:-1]] = -least[:-1] / least[-1]
+    return full
+
+
+def _joined(form: WeakForm, w: ndarray) -> ndarray:
+    """Return rows of the integrals of the terms and, in the last column, of the derivative."""
+    with np.errstate(all="ignore"):
+        target, design = form.rows(w)
+    return np.column_stack([design.reshape(target.size, -1), target.ravel()])
+
+
+def _round(
+    forms: Sequence[WeakForm],
+    support: ndarray,
+    coefficients: ndarray,
+    states: Sequence[ndarray],
+    accuracy: float,
+    number: int,
+) -> Estimate:
+    """Linearise about the states and coefficients, solve for the coefficients, and update the states."""
+    designs, targets, pieces = [], [], []
+    for form, w in zip(forms, states, strict=True):
+        target, design, slopes, covariance = linearised(form, w, coefficients, accuracy)
+        designs.append(covariance.whiten(design))
+        targets.append(covariance.whiten(target)[:, 0])
+        pieces.append((form, slopes, covariance, target, design))
+    regression = Regression(np.concatenate(designs), np.concatenate(targets))
+    found = regression.least_squares(support)
+    left = regression.target - regression.design @ found
+    chi2 = float(np.sum(left**2) / max(len(left) - np.sum(support), 1))
+    moved_states = []
+    for form, slopes, covariance, target, design in pieces:
+        pull = covariance.solve(target - design @ found)
+        w = form.state.seen.copy()
+        for slope in slopes:
+            w[slope.channel] -= slope.matrix.T @ pull[slope.equations].ravel()
+        moved_states.append(w)
+    stderr = np.zeros(len(found))
+    stderr[support] = _standard_errors(regression.design[:, support]) * np.sqrt(max(chi2, 1.0))
+    return Estimate(found, stderr, regression, chi2, tuple(moved_states), number, settled=False)
+
+
+def _standard_errors(design: ndarray) -> ndarray:
+    """Return the root of the diagonal of (A^T A)^-1; infinite where a column depends linearly on the others."""
+    scale = np.linalg.norm(design, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    _, values, modes = np.linalg.svd(design / scale, full_matrices=False)
+    if len(values) < design.shape[1] or len(values) == 0:
+        return np.full(design.shape[1], np.inf)
+    with np.errstate(divide="ignore"):
+        spread = np.where(values > 1e-14 * values[0], 1 / values, np.inf)
+    # A mode of infinite spread makes uncertain only the terms that are in it.
+    parts = np.where(np.abs(modes) > 1e-12, np.abs(modes), 0.0)
+    with np.errstate(invalid="ignore"):
+        shares = np.where(parts > 0, parts * spread[:, None], 0.0)
+    return np.asarray(np.sqrt(np.sum(shares**2, axis=0)) / scale)
+
+
+def eliminate(
+    regression: Regression, support: Bool[ndarray, " terms"], variance: float, gamma: float = 1.0
+) -> Bool[ndarray, " terms"]:
+    """Remove the least significant term, again and again, and return the support with the least information criterion.
+
+    The criterion is |y - A xi|^2 / variance + k (log n + 2 gamma log p), for k of p terms and n rows (Chen & Chen
+    2008).
+
+    Args:
+        regression: whitened rows.
+        support: the terms to begin with.
+        variance: of the rows.
+        gamma: 0 for the Bayesian information criterion, 1 for its extension to large libraries.
+    """
+    design, target = regression.design, regression.target
+    rows, terms = design.shape
+    price = np.log(rows) + 2 * gamma * np.log(terms)
+    # The triangular factor has the same sums of squares in few rows.
+    scale = np.linalg.norm(design, axis=0)
+    scaled = np.column_stack([design / np.where(scale > 0, scale, 1.0), target])
+    triangle = np.asarray(np.linalg.qr(scaled, mode="r"))
+    columns, right = triangle[:, :-1], triangle[:, -1]
+    left: ndarray = np.flatnonzero(support)
+    best, best_score = np.zeros(terms, dtype=bool), float("inf")
+    while True:
+        solution = np.linalg.lstsq(columns[:, left], right, rcond=1e-14)[0] if len(left) else np.zeros(0)
+        score = float(np.sum((right - columns[:, left] @ solution) ** 2)) / variance + price * len(left)
+        if score < best_score:
+            best = np.isin(np.arange(terms), left)
+            best_score = score
+        if len(left) == 0:
+            return best
+        z = np.abs(solution) / _standard_errors(columns[:, left])
+        left = np.delete(left, int(np.argmin(z)))
+
+
+Selection = Callable[[Estimate, "ndarray"], "ndarray"]
+
+
+def by_criterion(found: Estimate, support: Bool[ndarray, " terms"]) -> Bool[ndarray, " terms"]:
+    """Select terms by the extended Bayesian information criterion."""
+    return eliminate(found.regression, support, max(found.chi2, 1.0))
+
+
+def sparse_estimate(
+    forms: Sequence[WeakForm], rounds: int = ROUNDS, seed: int = 0, select: Selection | None = by_criterion
+) -> tuple[Estimate, Bool[ndarray, " terms"]]:
+    """Estimate all coefficients, select terms, and estimate the coefficients of the terms that stay.
+
+    Args:
+        forms: the weak equations of each trajectory.
+        rounds: largest number of times that the terms are evaluated per estimate.
+        seed: see `estimate`.
+        select: function that maps an estimate and its support to a smaller support; None to keep every term.
+
+    Returns:
+        the estimate, and its support.
+
+    Raises:
+        InputError: see `estimate`.
+    """
+    support = np.ones(len(forms[0].library.terms), dtype=bool)
+    found = estimate(forms, support, rounds, seed=seed)
+    if select is None:
+        return found, support
+    # The second pass judges with the covariance of the selected terms alone.
+    for _ in range(2):
+        chosen = select(found, support)
+        if np.array_equal(chosen, support):
+            break
+        support = chosen
+        found = estimate(forms, support, rounds, found)
+    return found, support
