@@ -43,8 +43,12 @@ class Record:
         return Record(stretches, self.value[begin:end], self.seen[begin:end], self.times[begin:end])
 
     def with_terms(self, terms: tuple[Term, ...]) -> Record:
-        """Return the record with an equation of other terms on the same chain."""
-        return replace(self, stretches=replace(self.stretches, dynamics=replace(self.stretches.dynamics, terms=terms)))
+        """Return the record with an equation of other terms; at unknown ends the same sites have an equation."""
+        dynamics = self.stretches.dynamics
+        least = dynamics.reach if dynamics.ends == "unknown" else dynamics.least_reach
+        return replace(
+            self, stretches=replace(self.stretches, dynamics=replace(dynamics, terms=terms, least_reach=least))
+        )
 
 
 def prepare(

@@ -110,11 +110,11 @@ def estimate_state(samples: Samples, order: int) -> SplineState:
         _, alone = _cross_validated(t, [field], [1.0], degree, tidy)
         noise.append(max(alone.noise, 1e-15 * _size(field), 1e-150))
     weights = [1 / sigma for sigma in noise]
-    intervals, fitted = _cross_validated(t, fields, weights, degree, tidy)
-    for finer in (max(FINENESS * intervals + 3, FEWEST), intervals + 3):
-        if finer <= _most_intervals(fields, degree):
-            fitted = _spline_fit(t, fields, weights, finer, degree, tidy)
-            break
+    intervals, _ = _cross_validated(t, fields, weights, degree, tidy)
+    most = _most_intervals(fields, degree)
+    wanted = (max(FINENESS * intervals + 3, FEWEST), intervals + 3)
+    finer = next((number for number in wanted if number <= most), intervals)
+    fitted = _spline_fit(t, fields, weights, finer, degree, tidy)
     count = len(fitted.seen[0])
     inverse: dict[int, ndarray] = {}
     for triangle in fitted.triangles:

@@ -133,6 +133,13 @@ def test_selection_drops_what_is_not_there():
     np.testing.assert_array_equal(fit.coefficients != 0, system.truth(one, {}) != 0)
 
 
+def test_at_unknown_ends_dropping_the_widest_term_leaves_the_same_sites_an_equation():
+    wide = library("wide", "u[n+1]+u[n-1]-2*u[n]; u[n]; u[n]**3; u[n+2]+u[n-2]-2*u[n]")
+    samples = seen("phi4", 0.01, 0, sites=15, times=sample_times(40, 8.0), ends="unknown")
+    fit = solve(Trajectory(select=True), [samples], wide, 2, 0)
+    np.testing.assert_array_equal(fit.coefficients != 0, [True, True, True, False])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "candidates"), FOUR)
 def test_intervals_cover_and_the_bound_is_reached_over_200_seeds(name, candidates):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,3 +30,11 @@ def test_a_state_with_gaps_is_uncertain_where_nothing_was_seen() -> None:
     state = estimate_state(Samples(t, u), 2)
     in_the_gap, outside = np.linalg.norm(state.basis(np.array([5.0, 2.5]), 0) @ state.factors[0], axis=1)
     assert in_the_gap > 5 * outside
+
+
+def test_all_channels_have_a_spline_where_the_samples_bear_no_finer_knots():
+    clean = simulate(systems.find("dnls"), sites=15, times=sample_times(40, 8.0))
+    seen = observe(clean, np.random.default_rng(0), noise=0.01, missing=0.1).observed()
+    u = np.where(np.isnan(seen.u), complex(np.nan, np.nan), seen.u)
+    state = estimate_state(replace(seen, u=u), 1)
+    assert len(state.seen) == len(state.factors) == 30
