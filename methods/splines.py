@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.methods.engine.collocation import Curves, Step, gauss_newton, objective, place_curves
+from latticebench.methods.engine.collocation import Curves, NormalEquations, normal_equations, objective, place_curves
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.methods.engine.record import prepare, without_halves
 from latticebench.methods.engine.shooting import LEAST_NOISE
@@ -171,16 +171,17 @@ class Splines:
             now = replace(stage, weight=stage.weight * 10)
         return best, path
 
-    def _minimised(self, curves: Sequence[Curves], start: _Stage) -> tuple[_Stage, list[Step]] | None:
+    def _minimised(self, curves: Sequence[Curves], start: _Stage) -> tuple[_Stage, list[NormalEquations]] | None:
         """Minimise for one weight; None where the linear algebra breaks down."""
         splines, coefficients, sigma, weight = list(start.splines), start.coefficients, start.sigma, start.weight
         now, misfit, _ = objective(curves, splines, coefficients, sigma, weight)
-        steps: list[Step] = []
+        steps: list[NormalEquations] = []
         covariance = np.zeros((len(coefficients),) * 2)
         for _ in range(self.steps):
             try:
                 steps = [
-                    gauss_newton(one, c, coefficients, sigma, weight) for one, c in zip(curves, splines, strict=True)
+                    normal_equations(one, c, coefficients, sigma, weight)
+                    for one, c in zip(curves, splines, strict=True)
                 ]
                 covariance = _inverse(np.sum([step.schur for step in steps], axis=0))
             except np.linalg.LinAlgError:

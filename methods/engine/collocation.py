@@ -198,7 +198,7 @@ def objective(
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class NormalEquations:
     """The linear algebra of one Gauss-Newton step for one trajectory.
 
     Attributes:
@@ -228,7 +228,9 @@ class Step:
         return np.array(traces)
 
 
-def gauss_newton(curves: Curves, splines: ndarray, coefficients: ndarray, sigma: ndarray, weight: float) -> Step:
+def normal_equations(
+    curves: Curves, splines: ndarray, coefficients: ndarray, sigma: ndarray, weight: float
+) -> NormalEquations:
     """Set up the Gauss-Newton step of one trajectory.
 
     Raises:
@@ -246,7 +248,7 @@ def gauss_newton(curves: Curves, splines: ndarray, coefficients: ndarray, sigma:
     solved = divide(np.column_stack([across, right]))
     schur = weight * (one.by_coefficient.T @ one.by_coefficient) - across.T @ solved[:, :-1]
     aim = -weight * (one.by_coefficient.T @ one.value) - across.T @ solved[:, -1]
-    return Step(divide, solved[:, -1], solved[:, :-1], schur, aim)
+    return NormalEquations(divide, solved[:, -1], solved[:, :-1], schur, aim)
 
 
 def _data_matrix(curves: Curves, sigma: ndarray) -> Any:

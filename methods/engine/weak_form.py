@@ -69,7 +69,13 @@ def bumps(
 
 @dataclass(frozen=True, eq=False)
 class Slope:
-    """The derivative of some weak equations by w of one channel: `matrix` (equations * tests, coefficients)."""
+    """The derivative of the residuals of some weak equations by the state of one channel.
+
+    Attributes:
+        channel: its number.
+        equations: numbers of the equations that depend on it.
+        matrix: the derivative by w (equations * tests, coefficients).
+    """
 
     channel: int
     equations: ndarray
@@ -85,6 +91,14 @@ class WeakForm:
         order: of the equation.
         half_width: half the support of the test functions, in knot intervals of the state.
         power: p of (1 - s^2)^p.
+
+    Attributes:
+        state: splines through the samples.
+        grid: times at which the integrands are evaluated (G,).
+        tests: the test functions and two derivatives, times the step of the grid (3, tests, G).
+        support: half the support of a test function, in units of time.
+        sites: the sites that have a weak equation.
+        parts: 1 for a real field, 2 for a complex one.
 
     Raises:
         InputError: too few samples or sites.
