@@ -1,1 +1,1 @@
-"""What methods share: equations with their derivatives, records, shooting, curves, weak form, regression, derivatives."""
+"""What methods share: equations of motion, records, shooting, curves, weak forms, regression, derivatives."""
