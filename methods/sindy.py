@@ -10,7 +10,6 @@ below `threshold` times the derivative's RMS is dropped, whatever the units and 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -19,52 +18,10 @@ import numpy as np
 
 from latticebench.methods.engine.derivatives import LOADS, takes
 from latticebench.methods.engine.regression import Regression, rows
+from latticebench.methods.engine.sparse import sparse_fit
 from latticebench.methods.method import Abilities, Fit
-from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
-
-
-def optimise(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> Any:
-    """Fit scaled rows with one of pysindy's optimisers, made afresh; its `coef_` are the terms' shares of the derivative.
-
-    Raises:
-        InputError: there is no such optimiser, or it refuses its arguments or the rows.
-    """
-    import pysindy.optimizers
-    from pysindy.optimizers import BaseOptimizer
-
-    known = {
-        name for name, kind in vars(pysindy.optimizers).items()
-        if isinstance(kind, type) and issubclass(kind, BaseOptimizer) and kind is not BaseOptimizer
-    }  # fmt: skip
-    if optimizer not in known:
-        error = unknown("pysindy optimiser", optimizer, known)
-        raise InputError(f"{error}; pysindy leaves out those whose solver is not installed (such as cvxpy)")
-    height = np.sqrt(np.mean(regression.target**2)) or 1.0
-    # Bagging draws from NumPy's global generator (pysindy 2.1), so it is seeded here and put back.
-    state = np.random.get_state()  # noqa: NPY002
-    np.random.seed(seed % 2**32)  # noqa: NPY002
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return getattr(pysindy.optimizers, optimizer)(**arguments).fit(
-                regression.design / (regression.scales * height), regression.target[:, None] / height
-            )
-    except Exception as error:
-        raise InputError(f"pysindy's {optimizer} with {dict(arguments)}: {error}") from error
-    finally:
-        np.random.set_state(state)  # noqa: NPY002
-
-
-def sparse_fit(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> np.ndarray:
-    """Fit with one of pysindy's optimisers as `optimise` does, and give the coefficients (terms,) in the data's units.
-
-    Raises:
-        InputError: there is no such optimiser, or it refuses its arguments or the rows.
-    """
-    coefficients: np.ndarray = np.asarray(optimise(regression, optimizer, arguments, seed).coef_)[0] / regression.scales
-    return coefficients
 
 
 @dataclass(frozen=True)

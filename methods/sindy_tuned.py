@@ -47,9 +47,9 @@ import numpy as np
 
 from latticebench.methods.engine.derivatives import KINDS, LOADS, differentiate, takes
 from latticebench.methods.engine.regression import Regression, rows
+from latticebench.methods.engine.sparse import fitted_optimizer
 from latticebench.methods.method import Abilities, Fit
 from latticebench.methods.pinn import inputs
-from latticebench.methods.sindy import optimise
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
@@ -191,7 +191,7 @@ def path(
     terms = regression.design.shape[1]
     small = triangular(regression)
     if optimizer in ("SSR", "FROLS"):
-        history = optimise(small, optimizer, {"alpha": 0.0, "max_iter": terms}, seed).history_
+        history = fitted_optimizer(small, optimizer, {"alpha": 0.0, "max_iter": terms}, seed).history_
         # In pysindy 2.1 the model of all terms is overwritten in SSR's history and missing in that of FROLS.
         supports = [np.ones(terms, dtype=bool), *(np.ravel(shares) != 0 for shares in history[1:])]
         return [(float(np.sum(support)), small.least_squares(support)) for support in supports]
@@ -201,9 +201,9 @@ def path(
             # The relaxation that has with few rows the effect of 1 with all.
             nu = len(regression.target) / len(small.target)
             given = {"reg_weight_lam": threshold**2 / (2 * nu), "relax_coeff_nu": nu, "max_iter": 1000, "tol": 1e-8}
-            shares = optimise(small, "SR3", {"regularizer": "L0", **given}, seed).coef_
+            shares = fitted_optimizer(small, "SR3", {"regularizer": "L0", **given}, seed).coef_
         else:
-            shares = optimise(small, "STLSQ", {"threshold": threshold, "alpha": 0.0}, seed).coef_
+            shares = fitted_optimizer(small, "STLSQ", {"threshold": threshold, "alpha": 0.0}, seed).coef_
         support = np.ravel(shares) != 0
         # Bagging is dear: a threshold that changes nothing for STLSQ is not bagged again.
         if support.tobytes() in listed:
@@ -216,7 +216,9 @@ def path(
             model = pysindy.STLSQ(threshold=threshold, alpha=0.0)
             drawn = min(len(regression.target), MOST_DRAWN)
             bags = {"opt": model, "bagging": True, "n_models": models, "n_subset": drawn}
-            coefficients = np.ravel(optimise(regression, "EnsembleOptimizer", bags, seed).coef_) / regression.scales
+            coefficients = (
+                np.ravel(fitted_optimizer(regression, "EnsembleOptimizer", bags, seed).coef_) / regression.scales
+            )
         found.append((threshold, coefficients))
     return found
 

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from latticebench.methods.engine.errors_in_variables import ROUNDS, Estimate, Selection, by_criterion, sparse_estimate
+from latticebench.methods.engine.sparse import sparse_fit
 from latticebench.methods.engine.weak_form import HALF_WIDTH, POWER, WeakForm
 from latticebench.methods.method import Abilities, Fit
-from latticebench.methods.sindy import sparse_fit
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples

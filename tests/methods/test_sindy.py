@@ -7,8 +7,8 @@ import pytest
 
 from latticebench import methods, systems
 from latticebench.methods.engine.regression import Regression
+from latticebench.methods.engine.sparse import sparse_fit
 from latticebench.methods.method import make, solve
-from latticebench.methods.sindy import sparse_fit
 from latticebench.systems.errors import InputError
 from latticebench.systems.samples import Samples
 from latticebench.systems.simulate import simulate

@@ -1,0 +1,80 @@
+"""pysindy's optimisers on a regression.
+
+Rows are divided by the RMS of the derivative and columns by the RMS of their term, so that an optimiser sees each
+coefficient as its term's share of the derivative, whatever the units and the number of samples.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from latticebench.systems.errors import InputError, unknown
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+    from latticebench.methods.engine.regression import Regression
+
+
+def fitted_optimizer(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> Any:
+    """Make one of pysindy's optimisers and fit it to the scaled rows of a regression.
+
+    Args:
+        regression: the rows.
+        optimizer: class name of the optimiser, such as STLSQ or FROLS.
+        arguments: its arguments; thresholds are shares of the derivative's RMS (dimensionless).
+        seed: of the draws of an optimiser that bags.
+
+    Returns:
+        the fitted optimiser; its `coef_` (1, terms) are shares of the derivative's RMS (dimensionless).
+
+    Raises:
+        InputError: there is no such optimiser, or it refuses its arguments or the rows.
+    """
+    import pysindy.optimizers
+    from pysindy.optimizers import BaseOptimizer
+
+    known = {
+        name for name, kind in vars(pysindy.optimizers).items()
+        if isinstance(kind, type) and issubclass(kind, BaseOptimizer) and kind is not BaseOptimizer
+    }  # fmt: skip
+    if optimizer not in known:
+        error = unknown("pysindy optimiser", optimizer, known)
+        raise InputError(f"{error}; pysindy leaves out those whose solver is not installed (such as cvxpy)")
+    height = np.sqrt(np.mean(regression.target**2)) or 1.0
+    # Bagging draws from NumPy's global generator (pysindy 2.1), which is seeded here and restored afterwards.
+    state = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed % 2**32)  # noqa: NPY002
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return getattr(pysindy.optimizers, optimizer)(**arguments).fit(
+                regression.design / (regression.scales * height), regression.target[:, None] / height
+            )
+    except Exception as error:
+        raise InputError(f"pysindy's {optimizer} with {dict(arguments)}: {error}") from error
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+
+
+def sparse_fit(
+    regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int
+) -> Float[ndarray, " terms"]:
+    """Return the coefficients (terms,) that one of pysindy's optimisers finds, in the data's units.
+
+    Args:
+        regression: the rows.
+        optimizer: class name of the optimiser, such as STLSQ or FROLS.
+        arguments: its arguments; thresholds are shares of the derivative's RMS (dimensionless).
+        seed: of the draws of an optimiser that bags.
+
+    Raises:
+        InputError: there is no such optimiser, or it refuses its arguments or the rows.
+    """
+    shares = np.asarray(fitted_optimizer(regression, optimizer, arguments, seed).coef_)[0]
+    return np.asarray(shares / regression.scales)
