@@ -46,10 +46,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from latticebench.methods.engine.derivatives import KINDS, LOADS, differentiate, takes
+from latticebench.methods.engine.inputs import inputs
 from latticebench.methods.engine.regression import Regression, rows
 from latticebench.methods.engine.sparse import fitted_optimizer
 from latticebench.methods.method import Abilities, Fit
-from latticebench.methods.pinn import inputs
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples

@@ -33,8 +33,9 @@ import pandas as pd
 from latticebench import methods, systems
 from latticebench.bench.provenance import origin
 from latticebench.bench.publish import render
+from latticebench.methods.engine.sizes import estimate_sizes
 from latticebench.methods.method import make, solve
-from latticebench.methods.pinn import PINN, scales
+from latticebench.methods.pinn import PINN
 from latticebench.systems.files import write_text
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
@@ -66,7 +67,7 @@ def problem(samples: Samples, library: Library, settings: PINN) -> Problem:
     """Set up the network and the loss of `pinn` in DeepXDE, for the four terms of lib2."""
     import deepxde as dde
 
-    sites, size = samples.sites, scales([samples], library, 2)
+    sites, size = samples.sites, estimate_sizes([samples], library, 2)
     units = settings.coefficient_scale * size.coefficients()
     xi = [dde.Variable(0.0) for _ in units]
     start, half = float(samples.t[0]), float(samples.t[-1] - samples.t[0]) / 2

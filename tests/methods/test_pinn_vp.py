@@ -1,3 +1,5 @@
+"""The network that is solved for: what it finds, and what its settings do."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -5,9 +7,9 @@ import pytest
 
 from latticebench import systems
 from latticebench.methods import pinn_vp
+from latticebench.methods.engine.members import member_draws
 from latticebench.methods.method import Skipped, make, solve
-from latticebench.methods.pinn import member_draws, scales
-from latticebench.methods.pinn_vp import PINNVP, Algebra, Curve, hidden, step
+from latticebench.methods.pinn_vp import PINNVP
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -31,75 +33,6 @@ def oscillators(sites: int = 3) -> tuple[Samples, np.ndarray]:
     amplitude, phase, w = 1 + 0.3 * np.arange(sites), 0.9 * np.arange(sites), np.sqrt(2)
     u = amplitude * np.cos(w * t[:, None] + phase)
     return Samples(t, u, -w * amplitude * np.sin(w * t[:, None] + phase)), np.array([-2.0, 0.0])
-
-
-def test_the_hidden_layer_is_orthonormal_and_its_derivatives_are_those_of_finite_differences():
-    times = np.linspace(1, 4, 81)
-    inner = np.array([1.7, 2.2, 3.9])
-    e = 1e-4
-    basis, at = hidden(times, np.concatenate([inner - e, inner, inner + e]), 15, 4.0, np.random.default_rng(0))
-    units = basis.value.shape[1]
-    np.testing.assert_allclose(basis.value.T @ basis.value / 81, np.eye(units), atol=1e-5)
-    before, here, after = np.split(at.value, 3)
-    well = np.max(np.abs(here), axis=0) < 1e3
-    np.testing.assert_allclose(at.first[3:6][:, well], ((after - before) / (2 * e))[:, well], rtol=1e-4, atol=1e-3)
-    np.testing.assert_allclose(
-        at.second[3:6][:, well], ((after - 2 * here + before) / e**2)[:, well], rtol=1e-2, atol=1
-    )
-
-
-CASES = {
-    "interior sites": (chain(5), "u[n+1]; u[n-1]; u[n]**3; v[n]", 2),
-    "free ends": (chain(4, "free"), "u[n+1]+u[n-1]; u[n]**2*v[n+1]", 2),
-    "antiperiodic ends": (chain(4, "antiperiodic"), "u[n+1]; n*u[n]; cos(1.7*t)", 2),
-    "fixed ends": (chain(4, "fixed"), "u[n+1]; u[n-1]; u[n]", 1),
-    "complex": (chain(5, is_complex=True), "u[n+1]; i*u[n-1]; abs(u[n])**2*u[n]", 1),
-}
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_the_right_hand_side_is_minus_half_the_slope_of_the_objective(name):
-    samples, texts, order = CASES[name]
-    candidates = library("lib", texts)
-    draw = np.random.default_rng(1)
-    curve = Curve(
-        samples, candidates, order, scales([samples], candidates, order), PINNVP(width=6, collocation=21), [draw],
-        Algebra("cpu"),
-    )  # fmt: skip
-    a, xi = curve.weights + 0.1 * draw.normal(size=curve.weights.shape), draw.normal(size=len(candidates.terms))
-    matrix, right = curve.normal(a, xi, 0.7)
-    np.testing.assert_allclose(matrix, matrix.T, rtol=1e-9, atol=1e-9 * np.max(np.abs(matrix)))
-
-    def objective(shift: np.ndarray) -> float:
-        moved = a + shift[: curve.unknowns].reshape(curve.outputs, curve.units).T
-        data, law = curve.misfits(moved, xi + shift[curve.unknowns :])
-        return data + 0.7**2 * law
-
-    for _ in range(5):
-        way = draw.normal(size=len(right)) / np.sqrt(len(right))
-        slope = (objective(1e-5 * way) - objective(-1e-5 * way)) / 2e-5
-        assert -2 * right @ way == pytest.approx(slope, rel=1e-5, abs=1e-6 * np.max(np.abs(right)))
-
-
-def test_a_step_and_the_trace_of_the_hat_matrix_are_those_of_plain_linear_algebra():
-    samples, texts, order = CASES["interior sites"]
-    candidates = library("lib", texts)
-    settings = PINNVP(width=5, collocation=21)
-    size = scales([samples], candidates, order)
-    curve = Curve(samples, candidates, order, size, settings, [np.random.default_rng(2)], Algebra("cpu"))
-    xi = np.array([0.5, 0.2, -0.3, 0.1])
-    matrix, right = curve.normal(curve.weights, xi, 0.3)
-    change = np.linalg.solve(matrix, right)
-    found = step([curve], [curve.weights], xi, 0.3, np.float64(0.0), hat=True)
-    np.testing.assert_allclose(found.coefficients - xi, change[curve.unknowns :], rtol=1e-5, atol=1e-8)
-    moved = change[: curve.unknowns].reshape(curve.outputs, curve.units).T
-    np.testing.assert_allclose(found.weights[0] - curve.weights, moved, rtol=1e-4, atol=1e-7)
-    inverse = np.linalg.inv(matrix)
-    np.testing.assert_allclose(found.covariance, inverse[curve.unknowns :, curve.unknowns :], rtol=1e-5)
-    of_data, _ = curve.normal(curve.weights, xi, 0.0)
-    # Between the trace without and with the coefficients' share, which is counted whole.
-    exact = float(np.trace(inverse @ of_data))
-    assert exact - 1e-6 <= found.freedom <= exact + len(xi) + 1e-6
 
 
 def test_an_oscillator_is_found_to_many_digits():
@@ -248,22 +181,3 @@ def test_of_several_members_the_best_is_the_fit_and_their_spread_is_that_of_the_
     spread = np.std([fit.coefficients for fit in alone], axis=0, ddof=1)
     found = [whole.found[f"spread of {text}"] for text in candidates.texts]
     np.testing.assert_allclose(found, spread, rtol=1e-12)
-
-
-@pytest.mark.parametrize("device", ["cpu", "cpu:0"])
-def test_a_matrix_that_cannot_be_factorised_is_told_and_the_others_are_right(device):
-    pytest.importorskip("torch")
-    algebra = Algebra(device)
-    good = np.array([[4.0, 1.0], [1.0, 3.0]])
-    bad = np.array([[1.0, 2.0], [2.0, 1.0]])
-    batches = [good, bad] if device == "cpu" else [np.stack([good, bad])]
-    results = [algebra.cholesky(algebra.move(one.copy())) for one in batches]
-    sound = np.concatenate([np.atleast_1d(np.asarray(one)) for _, one in results])
-    assert sound.tolist() == [True, False]
-    factor = results[0][0]
-    right = algebra.move(np.ones((2, 1)) if device == "cpu" else np.ones((2, 2, 1)))
-    solved, inverse = np.asarray(algebra.solve(factor, right)), np.asarray(algebra.inverse(factor))
-    if device != "cpu":
-        solved, inverse = solved[0], inverse[0]
-    np.testing.assert_allclose(good @ solved, np.ones((2, 1)), rtol=1e-14)
-    np.testing.assert_allclose(np.tril(inverse).T @ np.tril(inverse) @ good, np.eye(2), atol=1e-14)
