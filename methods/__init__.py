@@ -18,7 +18,7 @@ DEFAULT = "stlsq"
 
 
 def registered() -> dict[str, type[Method]]:
-    """Give every method of this package by its name: what the modules list in `METHODS`."""
+    """Return every method of this package by its name: what the modules list in `METHODS`."""
     found: dict[str, type[Method]] = {}
     for info in pkgutil.iter_modules(__path__):
         module = importlib.import_module(f"{__name__}.{info.name}")
@@ -27,10 +27,11 @@ def registered() -> dict[str, type[Method]]:
 
 
 def find(name: str, base: Path | None = None) -> type[Method]:
-    """Look a method up by its name, or in a user's file: `FILE.py` or, where it has several, `FILE.py:NAME`.
+    """Return a method by its name, or from a user's file.
 
     Args:
-        name: a name from `registered()`, or the path of a Python file that defines `METHODS`.
+        name: a name from `registered()`, or the path of a Python file that defines `METHODS`; where that has several
+            methods, `FILE.py:NAME`.
         base: the folder that a relative path starts from; the working directory when None.
 
     Raises:

@@ -18,8 +18,8 @@ class LeastSquares:
     """Least squares on differentiated samples, no term dropped.
 
     Attributes:
-        differentiation: see `methods.derivatives`.
-        options: further arguments for pysindy's ways of differentiating.
+        differentiation: see `methods.engine.derivatives`.
+        options: further arguments of the differentiation.
     """
 
     name: ClassVar[str] = "least-squares"
@@ -28,7 +28,7 @@ class LeastSquares:
 
     @property
     def abilities(self) -> Abilities:
-        """As far as the differentiation goes."""
+        """Those of the differentiation."""
         uneven, missing = takes(self.differentiation)
         return Abilities(uneven=uneven, missing=missing, loads=LOADS)
 

@@ -1,10 +1,10 @@
-"""The protocol of a method, what it can do, and the fit that it gives.
+"""The protocol of a method, what it can do, and the fit that it returns.
 
 A method is a frozen dataclass whose fields are its settings, with a `name`, `abilities` and
 
     fit(data, library, order, seed) -> Fit
 
-`data` is a list of trajectories, `library` the candidate terms T_j, `order` the order of the time derivative. The fit is the
+`data` is a list of trajectories, `library` the terms T_j, `order` the order of the time derivative. The fit has the
 real coefficients xi of
 
     d^order u_n / dt^order = sum_j xi_j T_j(u_{n+k}, v_{n+k}, f_n, n, t)
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Abilities:
-    """What a method can take; the runner skips it, with a reason, where the data ask for more.
+    """What a method can take; where the data ask for more it is skipped, with a reason.
 
     Attributes:
         complex: complex fields.
@@ -42,7 +42,7 @@ class Abilities:
         uneven: times that are not evenly spaced.
         missing: values that are NaN.
         truth: it must be shown the truth (a ceiling, not a contestant).
-        motion: its fits hold the motion that they follow, and the noise beside it.
+        motion: its fits have the motion that they follow, and the size of the noise.
         loads: packages that a fit imports; they are loaded before its clock starts.
     """
 
@@ -61,12 +61,12 @@ class Skipped(Exception):
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """How the coefficients came about.
+    """The coefficients on the way to a fit, K times.
 
     Attributes:
-        step: optimiser steps (K,), increasing.
+        step: number of the optimiser's step (K,), increasing.
         seconds: wall time since the start of the fit (K,).
-        loss: the objective (K,), of the method's own units.
+        loss: the objective (K,), in the method's own units.
         coefficients: (K, terms).
     """
 
@@ -83,7 +83,8 @@ class Smooth:
     Attributes:
         times: where the method asks for the equation (Q,).
         share: the share of the whole time that each of them stands for (Q,).
-        levels: u and its time derivatives up to the equation's order, real parts before imaginary ones (order + 1, Q, parts, N).
+        levels: u and its time derivatives up to the equation's order, real parts before imaginary ones, of shape
+            (order + 1, Q, parts, N).
     """
 
     times: Float[ndarray, " point"]
@@ -93,22 +94,24 @@ class Smooth:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Coefficients, and how they were had.
+    """Coefficients, and how they were found.
 
     Attributes:
         method: the method's name.
         library: the terms, in the order of the coefficients.
         order: the order of the time derivative.
-        coefficients: one real number a term, in the units of the derivative over those of the term.
+        coefficients: one real number per term, in the units of the derivative over those of the term.
         residual: RMS of what the equation leaves of the derivative, over the RMS of the derivative (dimensionless);
             NaN where the method has no derivative.
         stderr: standard errors, or None where the method gives none.
-        status: "ok", or what to know about the fit.
-        seconds, cpu_seconds: wall and processor time of the fit alone.
-        history: the way there, where there was one.
-        found: what the method found on its way (a threshold, a weight), by name.
-        motion: u and, for order 2, v of the fitted motion at the times of each trajectory, where the method follows one; the
-            noise that it leaves is then in `found`: noise_u and, where v was seen, noise_v, standard deviations of each real part.
+        status: "ok", or what a reader must know about the fit.
+        seconds: wall time of the fit alone.
+        cpu_seconds: processor time of the fit alone.
+        history: the coefficients on the way, of a method that iterates.
+        found: what else the method found (a threshold, a weight), by name.
+        motion: u and, for order 2, v of the fitted motion at the times of each trajectory, where the method follows
+            one. The noise is then in `found`: noise_u and, where v was observed, noise_v, standard deviations of each
+            real part.
         smooth: the curves of each trajectory, where the method fits curves and coefficients together.
 
     Raises:
@@ -130,7 +133,7 @@ class Fit:
     smooth: tuple[Smooth, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check that there is one coefficient a term."""
+        """Check that there is one coefficient per term."""
         expected = (len(self.library.terms),)
         for name, array in (("coefficients", self.coefficients), ("stderr", self.stderr)):
             if array is not None and np.shape(array) != expected:
@@ -138,7 +141,7 @@ class Fit:
 
 
 class Method(Protocol):
-    """What every method offers; a frozen dataclass whose fields are its settings."""
+    """What every method has; it is a frozen dataclass whose fields are its settings."""
 
     name: ClassVar[str]
 
@@ -153,10 +156,14 @@ class Method(Protocol):
 
 
 def make(kind: type[Method], given: Mapping[str, Any]) -> Method:
-    """Make a method with settings, given as values or as texts from a command line.
+    """Return a method with settings.
+
+    Args:
+        kind: the method's class.
+        given: settings by name, as values or as texts from a command line; the others have their defaults.
 
     Raises:
-        InputError: a setting that the method does not have, or a value of another type.
+        InputError: the method has no such setting, or the value is of another type.
     """
     import pydantic
 
@@ -180,7 +187,7 @@ def make(kind: type[Method], given: Mapping[str, Any]) -> Method:
 
 
 def settings(kind: type[Method]) -> dict[str, Any]:
-    """Give a method's settings with their defaults."""
+    """Return a method's settings with their defaults."""
     instance: Any = kind()
     return {one.name: getattr(instance, one.name) for one in fields(instance)} if is_dataclass(instance) else {}
 
@@ -188,10 +195,18 @@ def settings(kind: type[Method]) -> dict[str, Any]:
 def solve(method: Method, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
     """Check that a method can take the data, hide the truth from it, and time its fit.
 
+    Args:
+        method: the method, with its settings.
+        data: the trajectories.
+        library: the terms.
+        order: of the time derivative.
+        seed: of the method's random draws.
+
     Raises:
         Skipped: the method declares that it cannot take these data.
         InputError: the library cannot be evaluated on the data.
-        TypeError, ValueError: the method gave something that is no fit.
+        TypeError: the method returned something else than a Fit.
+        ValueError: a coefficient is not finite.
     """
     check_fit(data, library, order)
     reason = obstacle(method.abilities, data, library)
@@ -203,7 +218,7 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
     wall, cpu = time.perf_counter(), time.process_time()
     fit = method.fit(shown, library, order, seed)
     if not isinstance(fit, Fit):
-        raise TypeError(f"fit() gave {type(fit).__name__}; it must give a Fit")
+        raise TypeError(f"fit() returned {type(fit).__name__}; it must return a Fit")
     if not np.all(np.isfinite(fit.coefficients)):
         raise ValueError("the coefficients are not finite")
     return replace(fit, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
@@ -213,7 +228,8 @@ def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:
     """Check that a library makes sense on data.
 
     Raises:
-        InputError: wrong order, a complex term on a real field, a missing input, or fewer sites than the stencil needs.
+        InputError: the order is neither 1 nor 2, a term is complex and the field real, the input is missing, or there
+            are fewer sites than the stencil needs.
     """
     if order not in (1, 2):
         raise InputError(f"order is {order!r}; it must be 1 (du/dt) or 2 (d^2u/dt^2)")
@@ -226,7 +242,8 @@ def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:
             raise InputError(f"{samples.source}: {error}") from None
         if library.uses("f") and samples.f is None:
             raise InputError(
-                f"{samples.source}: the library uses f[n], but the data have no measured input f or f1..f{samples.sites}"
+                f"{samples.source}: the library uses f[n], "
+                f"but the data have no measured input f or f1..f{samples.sites}"
             )
         if library.uses("i") and not samples.is_complex:
             raise InputError(f"{samples.source}: the library uses i, but the field is real; leave the terms with i out")
@@ -235,7 +252,7 @@ def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:
 
 
 def obstacle(abilities: Abilities, data: Sequence[Samples], library: Library) -> str:
-    """Say why a method cannot take the data; empty when it can."""
+    """Return why a method cannot take the data; empty where it can."""
     checks: list[tuple[bool, Callable[[Samples], bool], str]] = [
         (abilities.complex, lambda s: s.is_complex, "it does not take complex fields"),
         (

@@ -1,7 +1,7 @@
 """The ceiling: least squares on the true terms, with the exact derivative.
 
-It is shown the truth, so it is no contestant. With the exact derivative it leaves round-off, whatever the noise: it checks the
-samples and the derived truth. With the spline's it shows what the right support alone is worth.
+It is shown the truth, so it is no contestant. With the exact derivative it leaves round-off, whatever the noise, which
+checks the samples and the derived truth. With the spline's it shows what the right support alone is worth.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class Oracle:
     """Least squares on the true support.
 
     Attributes:
-        derivative: `exact` regresses the noise-free derivative on the noise-free state; `spline` the smoothing spline's
-            on the samples, so that only the support is given away.
+        derivative: `exact`, the noise-free derivative on the noise-free state; or `spline`, the smoothing spline's
+            derivative of the samples, so that only the support is given away.
     """
 
     name: ClassVar[str] = "oracle"

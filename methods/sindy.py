@@ -1,11 +1,11 @@
 """Sparse regression with pysindy's optimisers on differentiated samples.
 
 `stlsq`: sequentially thresholded least squares (Brunton, Proctor & Kutz, PNAS 113, 3932 (2016)); `sr3`: sparse relaxed
-regularised regression (Zheng et al., IEEE Access 7, 1404 (2019)), debiased on its support as STLSQ is; `pysindy`: any other
-of pysindy's optimisers by its name.
+regularised regression (Zheng et al., IEEE Access 7, 1404 (2019)), debiased on its support as STLSQ is; `pysindy`: any
+other of pysindy's optimisers by its name.
 
-Rows are scaled by the RMS of the derivative and columns by the RMS of their term, so that a threshold is a share: a term
-below `threshold` times the derivative's RMS is dropped, whatever the units and the number of samples.
+Rows are scaled by the RMS of the derivative and columns by the RMS of their term, so that a threshold is a share: a
+term below `threshold` times the derivative's RMS is dropped, whatever the units and the number of samples.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ class STLSQ:
     Attributes:
         threshold: share of the derivative's RMS below which a term is dropped (dimensionless).
         alpha: ridge penalty; 0, because pysindy's default of 0.05 biases the selection.
-        max_iter: most rounds of thresholding.
-        differentiation, options: see `methods.derivatives`.
+        max_iter: maximum number of rounds of thresholding.
+        differentiation: see `methods.engine.derivatives`.
+        options: further arguments of the differentiation.
     """
 
     name: ClassVar[str] = "stlsq"
@@ -44,12 +45,12 @@ class STLSQ:
 
     @property
     def abilities(self) -> Abilities:
-        """As far as the differentiation goes."""
+        """Those of the differentiation."""
         uneven, missing = takes(self.differentiation)
         return Abilities(uneven=uneven, missing=missing, loads=LOADS)
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
-        """Threshold and refit until the support stays."""
+        """Threshold and refit until the support stays the same."""
         regression = rows(data, library, order, self.differentiation, self.options)
         arguments = {"threshold": self.threshold, "alpha": self.alpha, "max_iter": self.max_iter}
         return _fit(self.name, "STLSQ", arguments, regression, library, order, seed)
@@ -61,10 +62,13 @@ class SR3:
 
     Attributes:
         regularizer: the penalty: L0, L1 or L2.
-        reg_weight_lam: its weight; with L0 and a relaxation of 1 a term below sqrt(2 lam) of the derivative's RMS is dropped.
+        reg_weight_lam: its weight (dimensionless); with L0 and a relaxation of 1 a term below sqrt(2 reg_weight_lam)
+            times the derivative's RMS is dropped.
         relax_coeff_nu: the relaxation.
-        max_iter, tol: when to stop.
-        differentiation, options: see `methods.derivatives`.
+        max_iter: maximum number of iterations.
+        tol: change of the coefficients at which to stop, see pysindy.
+        differentiation: see `methods.engine.derivatives`.
+        options: further arguments of the differentiation.
     """
 
     name: ClassVar[str] = "sr3"
@@ -78,7 +82,7 @@ class SR3:
 
     @property
     def abilities(self) -> Abilities:
-        """As far as the differentiation goes."""
+        """Those of the differentiation."""
         uneven, missing = takes(self.differentiation)
         return Abilities(uneven=uneven, missing=missing, loads=LOADS)
 
@@ -97,9 +101,10 @@ class PySINDy:
     """Any of pysindy's optimisers.
 
     Attributes:
-        optimizer: its class name, such as SSR, FROLS or MIOSR.
-        arguments: its arguments, as a table.
-        differentiation, options: see `methods.derivatives`.
+        optimizer: class name of the optimiser, such as SSR, FROLS or MIOSR.
+        arguments: its arguments.
+        differentiation: see `methods.engine.derivatives`.
+        options: further arguments of the differentiation.
     """
 
     name: ClassVar[str] = "pysindy"
@@ -110,12 +115,12 @@ class PySINDy:
 
     @property
     def abilities(self) -> Abilities:
-        """As far as the differentiation goes."""
+        """Those of the differentiation."""
         uneven, missing = takes(self.differentiation)
         return Abilities(uneven=uneven, missing=missing, loads=LOADS)
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
-        """Hand the scaled rows to the optimiser."""
+        """Fit the scaled rows with the optimiser."""
         regression = rows(data, library, order, self.differentiation, self.options)
         return _fit(self.name, self.optimizer, self.arguments or {}, regression, library, order, seed)
 

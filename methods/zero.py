@@ -1,4 +1,4 @@
-"""The zero model: every coefficient 0. What a method must beat to have found anything."""
+"""The floor: every coefficient 0. What a method must beat to have found anything."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from latticebench.systems.samples import Samples
 
 @dataclass(frozen=True)
 class Zero:
-    """Says that nothing moves."""
+    """Every coefficient 0."""
 
     name: ClassVar[str] = "zero"
 
     @property
     def abilities(self) -> Abilities:
-        """Anything goes."""
+        """Everything but the truth."""
         return Abilities(missing=True)
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:  # noqa: ARG002
-        """Give zeros; the whole derivative is left."""
+        """Return zeros; the whole derivative is left."""
         return Fit(self.name, library, order, np.zeros(len(library.terms)), residual=1.0)
 
 

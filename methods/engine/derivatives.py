@@ -1,13 +1,14 @@
 """Time derivatives of sampled fields, for the methods that regress on them.
 
-`smoothing-spline`: a quintic spline with a penalty on its fourth derivative, the weight chosen by generalised cross-validation
-over all sites together (Craven & Wahba, Numer. Math. 31, 377 (1979)); it interpolates where the data have no noise.
-`spline`: the interpolating quintic spline. Any other name is one of pysindy's: `FiniteDifference`,
+`smoothing-spline`: a quintic spline with a penalty on its fourth derivative, the weight chosen by generalised
+cross-validation over all sites together (Craven & Wahba, Numer. Math. 31, 377 (1979)); it interpolates where the data
+have no noise. `spline`: the interpolating quintic spline. Any other name is one of pysindy's: `FiniteDifference`,
 `SmoothedFiniteDifference`, or a kind of its `SINDyDerivative` (the package `derivative`).
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -20,11 +21,13 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
+# Of the splines.
 DEGREE = 5
 # A dense eigenvalue problem of this size takes about a second.
 MAX_COEFFICIENTS = 1000
 # The kinds of the derivative package; most need their options.
 KINDS = ("finite_difference", "kalman", "kernel", "savitzky_golay", "spectral", "spline", "trend_filtered")
+# What a differentiation imports; a method that differentiates names it in its abilities.
 LOADS = ("pysindy", "scipy.interpolate", "scipy.linalg", "scipy.optimize")
 
 
@@ -38,7 +41,7 @@ class Smoothed:
 
 
 def takes(kind: str) -> tuple[bool, bool]:
-    """Say whether a way of differentiating takes uneven times, and missing values."""
+    """Return whether a kind of differentiation takes uneven times, and whether it takes missing values."""
     return kind in ("smoothing-spline", "spline", "FiniteDifference"), kind in ("smoothing-spline", "spline")
 
 
@@ -53,11 +56,11 @@ def differentiate(
     Args:
         t: times (T,).
         field: (T, N), real or complex.
-        kind: the way, see the module.
-        options: further arguments for pysindy's ways.
+        kind: of differentiation, see the module.
+        options: further arguments for pysindy's kinds.
 
     Raises:
-        InputError: there is no such way, its options are wrong, or there are too few samples.
+        InputError: there is no such kind, its options are wrong, or there are too few samples.
     """
     if np.iscomplexobj(field):
         # A value of which one part is missing is missing.
@@ -110,7 +113,7 @@ def _spline(t: ndarray, field: ndarray, *, smooth: bool) -> Smoothed:
 
 
 def _knots(x: ndarray) -> ndarray:
-    """Knots of the interpolating quintic spline through (at most MAX_COEFFICIENTS of) the sample times."""
+    """Return the knots of the quintic spline that interpolates at (at most MAX_COEFFICIENTS of) the sample times."""
     if len(x) > MAX_COEFFICIENTS:
         x = x[np.linspace(0, len(x) - 1, MAX_COEFFICIENTS).round().astype(int)]
     inner = x[DEGREE // 2 + 1 : -(DEGREE // 2 + 1)]
@@ -118,10 +121,10 @@ def _knots(x: ndarray) -> ndarray:
 
 
 def _smoothing_coefficients(x: ndarray, field: ndarray, knots: ndarray) -> ndarray:
-    """Minimise |field - B c|^2 + weight * integral of (fourth derivative)^2, the weight by generalised cross-validation.
+    """Return the c that minimise |field - B c|^2 + weight * integral of (fourth derivative)^2.
 
-    In the basis in which both terms are diagonal the hat matrix has the eigenvalues 1/(1 + weight d_k), so that one
-    eigenvalue problem serves all weights.
+    The weight is that of least generalised cross-validation. In the basis in which both parts are diagonal the hat
+    matrix has the eigenvalues 1/(1 + weight d_k), so that one eigenvalue problem serves all weights.
     """
     import scipy.linalg
     from scipy.interpolate import BSpline
@@ -131,7 +134,7 @@ def _smoothing_coefficients(x: ndarray, field: ndarray, knots: ndarray) -> ndarr
     count = basis.shape[1]
     gram = np.asarray((basis.T @ basis).todense())
     right = np.asarray(basis.T @ field)
-    # Two Gauss points a knot interval integrate the square of the fourth derivative, of degree 2, exactly.
+    # Two Gauss points per knot interval integrate the square of the fourth derivative, of degree 2, exactly.
     points, weights = np.polynomial.legendre.leggauss(2)
     edges = np.unique(knots)
     middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
@@ -179,9 +182,9 @@ def _pysindy(t: ndarray, field: ndarray, kind: str, options: Mapping[str, Any]) 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            way = make(**options)
-            first = np.asarray(way(field, t))
-            second = np.asarray(make(**options)(first, t))
+            # Copies, because pysindy writes into tables among its options.
+            first = np.asarray(make(**copy.deepcopy(options))(field, t))
+            second = np.asarray(make(**copy.deepcopy(options))(first, t))
     except Exception as error:
         raise InputError(f"differentiation {kind!r} with {dict(options)}: {error}") from error
     return Smoothed(field, first, second)

@@ -1,4 +1,4 @@
-"""The linear regression that most methods end in: one row a site, time and (real or imaginary) part."""
+"""The linear regression that most methods end in: one row per site, time and (real or imaginary) part."""
 
 from __future__ import annotations
 
@@ -38,32 +38,36 @@ class Regression:
 
     @property
     def status(self) -> str:
-        """Say "ok", or what a reader of the coefficients must know of the rows."""
+        """What a reader of the coefficients must know about the rows; "ok" where there is nothing."""
         if self.left_out:
             return f"{self.left_out} of {self.left_out + len(self.target)} rows left out: a term is not finite there"
         rank = int(np.linalg.matrix_rank(self.design / self.scales, tol=1e-12 * np.sqrt(self.design.size)))
         if rank < self.design.shape[1]:
-            return f"these data tell only {rank} of {self.design.shape[1]} terms apart; the coefficients are one choice of many"
+            count = self.design.shape[1]
+            return f"these data tell only {rank} of {count} terms apart; the coefficients are one choice of many"
         return "ok"
 
     @property
     def scales(self) -> Float[ndarray, " terms"]:
-        """RMS of each column of A over that of y, so that xi * scales is each term's share; 1 where that is 0."""
+        """RMS of each column of A over that of y (terms,): xi * scales are the terms' shares of y; 1 where it is 0."""
         columns = np.sqrt(np.mean(self.design**2, axis=0))
         height = np.sqrt(np.mean(self.target**2))
         scale = columns / (height if height > 0 else 1.0)
         return np.where(scale > 0, scale, 1.0)
 
     def residual(self, coefficients: Float[ndarray, " terms"]) -> float:
-        """RMS of y - A xi over the RMS of y."""
+        """Return the RMS of y - A xi over the RMS of y."""
         left = np.sqrt(np.mean((self.target - self.design @ coefficients) ** 2))
         height = np.sqrt(np.mean(self.target**2))
         return float(left / height) if height > 0 else float(left)
 
     def least_squares(self, support: ndarray | None = None) -> Float[ndarray, " terms"]:
-        """Solve by least squares, on the terms in `support` alone when it is given (the others are 0).
+        """Return the coefficients (terms,) that minimise |y - A xi|^2.
 
-        The smallest-norm solution, on scaled columns, where the terms cannot be told apart.
+        Where the terms cannot be told apart, they are those of smallest norm on scaled columns.
+
+        Args:
+            support: which terms may differ from 0 (terms,); all of them when None.
         """
         chosen = np.arange(self.design.shape[1]) if support is None else np.flatnonzero(support)
         coefficients = np.zeros(self.design.shape[1])
@@ -72,6 +76,17 @@ class Regression:
             solution = np.linalg.lstsq(self.design[:, chosen] / scale, self.target, rcond=1e-14)[0]
             coefficients[chosen] = solution / scale
         return coefficients
+
+
+def triangular(regression: Regression) -> Regression:
+    """Return a regression with the same sums of squares in as few rows as columns, by the QR decomposition of [A y]."""
+    if len(regression.target) <= regression.design.shape[1] + 1:
+        return regression
+    # On scaled columns, so that the units of a term do not matter.
+    scale = np.append(regression.scales, 1.0)
+    table = np.column_stack([regression.design, regression.target]) / scale
+    triangle = np.asarray(np.linalg.qr(table, mode="r")) * scale
+    return Regression(triangle[:, :-1], triangle[:, -1])
 
 
 def rows(
@@ -83,7 +98,14 @@ def rows(
 ) -> Regression:
     """Differentiate the samples and evaluate the library on them.
 
-    A velocity that was observed is differentiated once for the second derivative; one that was not is the first derivative of u.
+    For the second derivative an observed velocity is differentiated once; where none was observed, u twice.
+
+    Args:
+        data: the trajectories.
+        library: the terms.
+        order: of the time derivative.
+        differentiation: see `methods.engine.derivatives`.
+        options: further arguments of the differentiation.
 
     Raises:
         InputError: the differentiation fails, or no row is complete.
@@ -126,7 +148,15 @@ def rows(
 def assemble(
     samples: Samples, library: Library, u: ndarray, v: ndarray | None, rate: Float[ndarray, "time sites"]
 ) -> Regression:
-    """Make the rows of one trajectory from its state and the derivative to explain; rows with NaN are left out."""
+    """Return the rows of one trajectory, without those that have a NaN.
+
+    Args:
+        samples: the trajectory: its times, input and ends.
+        library: the terms.
+        u: the field (T, N) on which they are evaluated.
+        v: its velocity, or None.
+        rate: the derivative to explain.
+    """
     values = evaluate(library.terms, u, v, samples.f, samples.t, ends=samples.ends)
     inner = rate[:, observed(samples.sites, library.reach, samples.ends)]
     target = np.stack([inner.real, inner.imag] if samples.is_complex else [inner]).ravel()

@@ -26,7 +26,7 @@ METHODS = sorted(methods.registered())
 
 
 def attempt(name: str, samples: SimulatedSamples, candidates: Library, order: int) -> Fit | str:
-    """Fit, or give the reason why the method cannot."""
+    """Return the fit, or the reason why the method cannot."""
     try:
         return solve(quick(name), [samples], candidates, order, seed=3)
     except Skipped as skipped:
@@ -210,7 +210,7 @@ def test_curves_that_a_method_gives_follow_the_samples_and_their_levels_are_deri
 ) -> None:
     samples = request.getfixturevalue(data)
     system = systems.find(data)
-    # Derivatives are compared by quadrature over the points where the method asks for the equation: as many as it has by itself.
+    # Derivatives are compared by quadrature over the points where the method asks for the equation: its own number.
     kind = methods.find(name)
     method = make(kind, {key: value for key, value in QUICK.items() if key in settings(kind) and key != "collocation"})
     try:

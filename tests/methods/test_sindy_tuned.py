@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from latticebench import methods, systems
-from latticebench.methods.engine.regression import Regression
+from latticebench.methods.engine.integrated_equation import integrate_equation
+from latticebench.methods.engine.regression import Regression, triangular
 from latticebench.methods.engine.sparse import sparse_fit
 from latticebench.methods.method import make, solve
-from latticebench.methods.sindy_tuned import OPTIMIZERS, SINDyTuned, options, path, triangular, windows
+from latticebench.methods.sindy_tuned import OPTIMIZERS, SINDyTuned, options, path
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -68,7 +69,7 @@ def test_the_support_is_right_without_noise_and_nearly_always_at_a_thousandth(na
 
 @pytest.mark.parametrize("seen", [True, False])
 def test_the_windows_hold_for_the_true_equation_and_for_no_other(*, seen: bool) -> None:
-    judge = windows([oscillators(120, seen=seen)], library("lib", "u[n]; u[n]**3"), 2, 0.7)
+    judge = integrate_equation([oscillators(120, seen=seen)], library("lib", "u[n]; u[n]**3"), 2, 0.7)
     size = np.sum(judge.regression.target**2)
     right, wrong = judge.lost(np.array([[-2.0, 0.0], [-2.02, 0.0]]))
     assert right <= 1e-9 * size
@@ -84,7 +85,7 @@ def test_the_windows_hold_for_complex_fields_inputs_and_missing_values() -> None
     u = driven[:, None] + np.exp(rate * t)[:, None] * np.array([1.0, -0.5j])
     u[np.random.default_rng(1).uniform(size=u.shape) < 0.1] = np.nan
     f = np.cos(t)[:, None] * np.ones(2)
-    judge = windows([Samples(t, u, f=f)], library("lib", "u[n]; i*u[n]; f[n]"), 1, 0.7)
+    judge = integrate_equation([Samples(t, u, f=f)], library("lib", "u[n]; i*u[n]; f[n]"), 1, 0.7)
     np.testing.assert_allclose(judge.regression.least_squares(), [-0.1, 0.3, 1.0], atol=1e-4)
 
 
@@ -158,7 +159,7 @@ def test_uneven_times_and_missing_values_leave_the_splines_alone_in_the_search()
     times = sample_times(50, 6.0, np.random.default_rng(2))
     gappy = observe(simulate(system, sites=11, times=times), np.random.default_rng(1), noise=0.001, missing=0.05)
     found = SINDyTuned().search([gappy.observed()], system.library("lib2"), 2, 1)
-    assert {one.differentiation for one in found} == {"smoothing-spline", "spline"}
+    assert {one.rows.differentiation for one in found} == {"smoothing-spline", "spline"}
 
 
 def test_every_differentiation_that_may_be_asked_for_works_with_its_options() -> None:
@@ -168,7 +169,7 @@ def test_every_differentiation_that_may_be_asked_for_works_with_its_options() ->
         method = SINDyTuned(differentiations=(kind,), optimizers=("STLSQ",))
         fit = solve(method, [samples], terms, 2, 1)
         assert abs(fit.coefficients[0] + 2) < 0.5, kind
-        names = {one.differentiation for one in method.search([samples], terms, 2, 1)}
+        names = {one.rows.differentiation for one in method.search([samples], terms, 2, 1)}
         assert len(names) == len(options(kind, 0.1)), kind
 
 

@@ -88,6 +88,12 @@ def test_wrong_ways_and_options_are_told() -> None:
         differentiate(T, FIELD, "savitzky_golay", {"nonsense": 2})
 
 
+def test_the_options_stay_as_they_were_given() -> None:
+    options = {"smoother_kws": {"window_length": 7, "polyorder": 3}}
+    differentiate(T, FIELD, "SmoothedFiniteDifference", options)
+    assert options == {"smoother_kws": {"window_length": 7, "polyorder": 3}}
+
+
 def test_every_kind_of_the_derivative_package_is_known() -> None:
     from derivative.differentiation import methods
 
