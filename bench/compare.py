@@ -1,24 +1,45 @@
-"""Comparing two tables of cases: what got better, what got worse."""
+"""Comparing two runs: which cases got better, and which worse.
+
+Runs are compared case by case in a table of a common form, whatever their kind:
+
+    identity    by which a case is known in both
+    case        what people call it
+    status      ok, or what went wrong
+    right       for trials, whether the diagnosis was right; missing for others
+    e2          for fits, the relative error of the coefficients
+    residual    what is left of the derivative (fits) or of the readings, in units of the noise (diagnoses)
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.published import read_table
+from latticebench.bench.store import is_store, open_store
 from latticebench.systems.errors import InputError
 
 # Round-off differs between machines; errors below this are all the same.
 FLOOR = 1e-9
 FACTOR = 2.0
+COLUMNS = ("identity", "case", "status", "right", "e2", "residual")
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The cases that two tables share, by what became of them: each a table with `case`, `old` and `new`.
+    """The cases that two runs share, by what became of them.
 
-    `gone` are cases that only the old table has, `fresh` those that only the new one has.
+    Attributes:
+        worse, better: tables with `case`, `old`, `new` (each with its measure) and `ratio` (of the errors).
+        same: how many did neither.
+        gone: cases that only the old run has.
+        fresh: cases that only the new one has.
     """
 
     worse: pd.DataFrame
@@ -29,63 +50,135 @@ class Comparison:
 
 
 def compare(old: pd.DataFrame, new: pd.DataFrame, factor: float = FACTOR, floor: float = FLOOR) -> Comparison:
-    """Compare the coefficient errors of the cases that two tables share.
+    """Compare the cases that two runs share.
 
-    A case is worse when its E2 (without a truth: its residual) has grown by more than `factor`, both counted as at least
-    `floor`, or when it had a fit and has none any more.
+    A case is worse when its diagnosis was right and is wrong; when its E2 (without one: its residual) has grown by more than
+    `factor`, both counted as at least `floor`; or when it had a result and has none any more.
+
+    Args:
+        old: see `read_run`.
+        new: the same, to be judged.
+        factor: of two errors that count as the same.
+        floor: errors below it are all the same.
 
     Raises:
         InputError: no case is in both.
     """
-    if not set(old["identity"]) & set(new["identity"]):
-        raise InputError("the two tables have no case in common; compare runs of the same suite")
     before, after = (table.drop_duplicates("identity").set_index("identity") for table in (old, new))
-    worse, better, same = [], [], 0
-    for identity in before.index:
-        if identity not in after.index:
-            continue
-        a, b = before.loc[identity], after.loc[identity]
-        name = f"{b['data']} | {b['library']} | {b['method']} | seed {b['seed']}"
-        error_a, error_b = _error(a, b)
-        row = {
-            "case": name,
-            "old": _shown(a, error_a),
-            "new": _shown(b, error_b),
-            "ratio": error_b / error_a if error_a else np.nan,
-        }
-        first, second = max(error_a, floor), max(error_b, floor)
-        if second > factor * first:
-            worse.append(row)
-        elif first > factor * second:
-            better.append(row)
-        else:
-            same += 1
-    columns = ["case", "old", "new", "ratio"]
-    return Comparison(
-        pd.DataFrame(worse, columns=columns),
-        pd.DataFrame(better, columns=columns),
-        same,
-        [_name(before.loc[i]) for i in before.index if i not in after.index],
-        [_name(after.loc[i]) for i in after.index if i not in before.index],
-    )
+    shared = before.index.intersection(after.index, sort=False)
+    if shared.empty:
+        raise InputError("the two tables have no case in common; compare runs of the same suite")
+    found: dict[int, list[dict[str, Any]]] = {-1: [], 0: [], 1: []}
+    for a, b in zip(before.loc[shared].to_dict("records"), after.loc[shared].to_dict("records"), strict=True):
+        measure, first, second = _errors(a, b)
+        change = _change(a, b, max(first, floor), max(second, floor), factor)
+        row = {"case": b["case"], "old": _shown(a, measure, first), "new": _shown(b, measure, second)}
+        found[change].append({**row, "ratio": second / first if first else np.nan})
+    worse, better = (pd.DataFrame(found[change], columns=["case", "old", "new", "ratio"]) for change in (1, -1))
+    gone, fresh = before.index.difference(after.index, sort=False), after.index.difference(before.index, sort=False)
+    return Comparison(worse, better, len(found[0]), list(before.loc[gone, "case"]), list(after.loc[fresh, "case"]))
 
 
-def _error(a: pd.Series, b: pd.Series) -> tuple[float, float]:
-    """Give both errors by the same measure; one that has no fit, be it skipped, is infinite."""
+def _change(a: Mapping[Any, Any], b: Mapping[Any, Any], first: float, second: float, factor: float) -> int:
+    """Return 1 where a case got worse, -1 where it got better, else 0."""
+    if not pd.isna(a["right"]) and not pd.isna(b["right"]) and a["right"] != b["right"]:
+        return 1 if a["right"] else -1
+    return int(second > factor * first) - int(first > factor * second)
+
+
+def _errors(a: Mapping[Any, Any], b: Mapping[Any, Any]) -> tuple[str, float, float]:
+    """Return the measure that two results have, and the error of both; one without a result, be it skipped, is infinite."""
     measure = "residual" if pd.isna(a["e2"]) and pd.isna(b["e2"]) else "e2"
-
-    def one(row: pd.Series) -> float:
-        value = row.get(measure, np.nan)
-        return float(value) if row["status"] == "ok" and not pd.isna(value) else np.inf
-
-    first, second = one(a), one(b)
+    first, second = (
+        float(one[measure]) if one["status"] == "ok" and not pd.isna(one[measure]) else np.inf for one in (a, b)
+    )
     # Two failures are no change.
-    return (1.0, 1.0) if first == second == np.inf else (first, second)
+    return (measure, 1.0, 1.0) if first == second == np.inf else (measure, first, second)
 
 
-def _shown(row: pd.Series, error: float) -> str:
-    return f"{error:.3g}" if row["status"] == "ok" else str(row["status"])
+def _shown(row: Mapping[Any, Any], measure: str, error: float) -> str:
+    if row["status"] != "ok":
+        return str(row["status"])
+    judged = "" if pd.isna(row["right"]) else "right, " if row["right"] else "wrong, "
+    return f"{judged}{'E2' if measure == 'e2' else measure} {error:.3g}"
 
 
-def _name(row: pd.Series) -> str:
-    return f"{row['data']} | {row['library']} | {row['method']} | seed {row['seed']}"
+# Reading a run ------------------------------------------------------------------------------------------------------------
+
+
+def read_run(path: Path) -> pd.DataFrame:
+    """Read a run in the common form: a store, a folder of published tables, or one published table.
+
+    Raises:
+        InputError: there is none of these at `path`.
+    """
+    if is_store(path):
+        from latticebench.bench.kinds import each
+
+        parts = [FORMS[name](kind.table(results)) for name, kind, results, _ in each(open_store(path))]
+        return pd.concat(parts, ignore_index=True)
+    if path.is_dir():
+        published = [path / name for name in ("cases.csv", "trials.csv") if (path / name).is_file()]
+        parts = [read_run(file) for file in published]
+        if (path / "measured.md").is_file():
+            parts.append(_reports(sorted(path.glob("*.json"))))
+        if parts:
+            return pd.concat(parts, ignore_index=True)
+    if not path.is_file():
+        raise InputError(
+            f"{path}: no results; give a store of them, a folder of published tables, a cases.csv or a trials.csv"
+        )
+    frame = read_table(path)
+    if "effect" in frame and "identity" not in frame:
+        return _of_trials(frame)
+    missing = [name for name in ("identity", "status", "e2") if name not in frame]
+    if missing:
+        raise InputError(f"{path}: neither a table of cases nor of trials: the column {missing[0]!r} is missing")
+    return _of_fits(frame)
+
+
+def _of_fits(frame: pd.DataFrame) -> pd.DataFrame:
+    parts = ["data", "library", "method"]
+    title = frame[parts[0]].str.cat(frame[parts[1:]], sep=" | ") + " | seed " + frame["seed"].astype(str)
+    return _common(frame, identity=frame["identity"], case=title)
+
+
+def _of_trials(frame: pd.DataFrame) -> pd.DataFrame:
+    told = frame.assign(**{name: pd.to_numeric(frame[name]).map("{:g}".format) for name in ("z", "noise", "seed")})
+    seen = np.where(frame["velocities"].astype(str) == "False", " only u", "")
+    title = told["system"] + " noise=" + told["noise"] + seen
+    title += " | " + told["effect"] + " z=" + told["z"] + " | seed " + told["seed"]
+    right = frame["right"].map({True: True, False: False, "True": True, "False": False})
+    return _common(frame, identity=title, case=title, right=right, residual=frame["residual_after"])
+
+
+def _of_recordings(frame: pd.DataFrame) -> pd.DataFrame:
+    return _common(frame, identity=frame["name"], case=frame["name"], residual=frame["residual_after"])
+
+
+FORMS = {"fit": _of_fits, "trial": _of_trials, "measured": _of_recordings}
+
+
+def _reports(paths: Iterable[Path]) -> pd.DataFrame:
+    from latticebench.bench.trials.findings import summarised
+
+    rows = []
+    for path in paths:
+        try:
+            found = summarised(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError, KeyError, TypeError):
+            raise InputError(f"{path}: not the report on a recording") from None
+        rows.append({"name": path.stem, "status": "ok", **found})
+    return _of_recordings(pd.DataFrame(rows))
+
+
+def _common(frame: pd.DataFrame, **columns: Any) -> pd.DataFrame:
+    made = frame.assign(**columns)
+    for name in COLUMNS:
+        if name not in made:
+            made[name] = np.nan
+    return _numbers(made[list(COLUMNS)], ("e2", "residual"))
+
+
+def _numbers(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
+    return frame.assign(**{name: pd.to_numeric(frame[name], errors="coerce") for name in names})

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.fitting import FitCase
 from latticebench.bench.provenance import lines
-from latticebench.bench.suite import Case
 from latticebench.bench.tables import cases, summary
 from latticebench.systems.files import whole
 from latticebench.systems.terms import Term
@@ -33,7 +33,7 @@ MOST_NAMES = 14
 
 
 def draw_all(
-    results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = FIGURES
+    results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = FIGURES
 ) -> list[Path]:
     """Draw every figure that the results allow, or those of some kinds, and give the files.
 
@@ -57,14 +57,14 @@ def draw_all(
     return written
 
 
-def panels(results: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+def panels(results: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
     """Group results by what was fitted: those of one group share their samples and library.
 
     Only groups in which a method kept its history are given, each under a name for its file.
     """
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for result in results:
-        case = Case.model_validate(result["case"])
+        case = FitCase.model_validate(result["case"])
         if result["coefficients"] is not None:
             groups.setdefault(slug(f"{case.part} {case.data} {case.library} seed {case.seed}"), []).append(result)
     return {name: group for name, group in groups.items() if any(result["history"] for result in group)}
@@ -87,7 +87,7 @@ def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
     from matplotlib.lines import Line2D
 
     learnt = [result for result in group if result["history"]]
-    case = Case.model_validate(group[0]["case"])
+    case = FitCase.model_validate(group[0]["case"])
     terms, truth = list(group[0]["coefficients"]), group[0]["truth"]
     colours = _colours(terms, truth)
     widths = [4.0] * len(learnt) + [0.8 + 0.55 * len(group)]

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import os
 import platform
 import re
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 DISTRIBUTION = "latticebench"
+# Seeds in a row that are named one by one.
+MOST_LISTED = 10
 
 
 def origin() -> dict[str, Any]:
@@ -22,23 +25,33 @@ def origin() -> dict[str, Any]:
     return {"commit": commit(), "date": date, "machine": machine(), "versions": versions()}
 
 
-def describe(results: Sequence[Mapping[str, Any]], run: Mapping[str, Any]) -> dict[str, Any]:
+def describe(origins: Sequence[Mapping[str, Any]], run: Mapping[str, Any], seeds: Iterable[int] = ()) -> dict[str, Any]:
     """Describe where results come from: a flat dictionary of texts, numbers and lists.
 
     Args:
-        results: with their origins in `made`; where these differ, all are named.
+        origins: of the results; where these differ, all are named.
         run: the command and what else was written down when the suite was run last.
+        seeds: of the cases; 1 where none has any.
     """
-    described: dict[str, Any] = {name: value for name, value in run.items() if name != "keys"}
+    described: dict[str, Any] = dict(run)
     for name in ("commit", "date", "machine"):
-        described[name] = sorted({str(result["made"][name]) for result in results})
+        described[name] = sorted({str(one[name]) for one in origins})
     packages: dict[str, set[str]] = {}
-    for result in results:
-        for package, version in result["made"]["versions"].items():
+    for one in origins:
+        for package, version in one["versions"].items():
             packages.setdefault(package, set()).add(version)
     described["versions"] = {package: " and ".join(sorted(found)) for package, found in packages.items()}
-    described["seeds"] = sorted({int(result["case"]["seed"]) for result in results})
+    described["seeds"] = _ranges(sorted(seeds) or [1])
     return described
+
+
+def _ranges(numbers: Sequence[int]) -> list[int | str]:
+    """Write more than MOST_LISTED numbers in a row as their range, such as "1-100"."""
+    found: list[int | str] = []
+    for _, group in itertools.groupby(enumerate(numbers), key=lambda pair: pair[1] - pair[0]):
+        run = [number for _, number in group]
+        found += run if len(run) <= MOST_LISTED else [f"{run[0]}-{run[-1]}"]
+    return found
 
 
 def commit() -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from latticebench.bench.provenance import lines
-from latticebench.bench.tables import ABOUT, cases, coefficients, limits, summary
+from latticebench.bench.tables import ABOUT, summary, tables
 from latticebench.systems.files import write_text
 from latticebench.systems.terms import Term
 
@@ -70,7 +70,7 @@ def format_number(value: Any) -> str:
 
 
 def publish(
-    results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = TABLES
+    results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = TABLES
 ) -> list[Path]:
     """Write the tables, each as CSV, Markdown and LaTeX with its provenance.
 
@@ -79,17 +79,11 @@ def publish(
     Raises:
         InputError: a file cannot be written.
     """
-    table = cases(results)
-    made: dict[str, Callable[[], pd.DataFrame]] = {
-        "cases": lambda: table,
-        "coefficients": lambda: coefficients(results),
-        "limits": lambda: limits(results),
-        "summary": lambda: summary(table),
-        "errors": lambda: matrix(table),
-    }
+    made = tables(results)
+    made |= {"summary": summary(made["cases"]), "errors": matrix(made["cases"])}
     written = []
     for name in only:
-        frame = made[name]()
+        frame = made[name]
         for form in FORMATS if len(frame) <= MOST_READ else FORMATS[:1]:
             if frame.empty:
                 continue

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
+    from latticebench.bench.case import Case
     from latticebench.bench.limit import Design, Limit
-    from latticebench.bench.suite import Case
     from latticebench.methods.method import Fit
 
 MEANINGS = {"e2": "relative error of the coefficients, median over seeds"}
@@ -94,7 +94,7 @@ def show_limit(limit: Limit, design: Design, note: str) -> None:
         console().print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def show_results(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], title: str, value: str = "e2") -> None:
+def show_results(results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], title: str, value: str = "e2") -> None:
     """Print a run's results: one score by data and method, what went wrong, and where the figures come from."""
     from latticebench.bench.provenance import lines
     from latticebench.bench.publish import matrix

@@ -1,56 +1,94 @@
-"""Which source a result depends on, so that a changed method is run again and an unchanged one is not."""
+"""The key under which a result is stored: a hash of the case and of the code that decides its result.
+
+A changed method, engine or system is run again, an unchanged one is not; comments, docstrings, layout, and every module that the
+computation does not import (pages, tables, the runner, the command line) do not count.
+"""
 
 from __future__ import annotations
 
 import ast
 import functools
 import hashlib
+import importlib
 import importlib.util
 import inspect
-from collections.abc import Iterable
+import pkgutil
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from latticebench import systems
+from latticebench import methods, systems
+from latticebench.bench.case import Case, Folders, Roots
+from latticebench.systems.errors import unknown
 
 PACKAGE = "latticebench"
+# Hexadecimal digits of a key: 128 bits.
+DIGITS = 32
 
 
-def fingerprint(kinds: Iterable[type], system: str, base: Path) -> str:
-    """Hash the source of methods, of a system, and of every module of this project that they import.
-
-    Comments, docstrings and layout do not count.
+def keys(cases: Mapping[str, Case], folders: Folders) -> dict[str, str]:
+    """Return the keys of cases.
 
     Args:
-        kinds: the methods' classes.
-        system: a system's name or file.
-        base: the folder that a relative path starts from.
+        cases: by their identities.
+        folders: where relative paths start from.
+
+    Returns:
+        the keys by the identities, in the same order.
     """
-    files = {Path(inspect.getfile(kind)) for kind in kinds} | {_module_file("latticebench.bench.case")}
-    if system.endswith((".py", ".toml")):
-        files.add(base / system)
-    else:
-        files.add(_module_file(_home(system)))
-    found: set[Path] = set()
-    while files:
-        path = files.pop().resolve()
-        if path not in found:
-            found.add(path)
-            files |= _imports(path, path.stat().st_mtime_ns)
-    digests = sorted(_digest(path, path.stat().st_mtime_ns) for path in found)
+    prints: dict[Roots, str] = {}
+    found = {}
+    for identity, case in cases.items():
+        roots = case.roots
+        if roots not in prints:
+            prints[roots] = fingerprint(roots, folders)
+        found[identity] = hashlib.sha256(f"{identity}\n{prints[roots]}".encode()).hexdigest()[:DIGITS]
+    return found
+
+
+def fingerprint(roots: Roots, folders: Folders) -> str:
+    """Hash all that a result is computed from: modules without their comments and docstrings, other files as they are."""
+    digests = sorted(_digest(path, path.stat().st_mtime_ns) for path in files(roots, folders))
     return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
-@functools.cache
-def _home(system: str) -> str:
-    """Name the module that defines a system of this package."""
-    import importlib
-    import pkgutil
+def files(roots: Roots, folders: Folders) -> set[Path]:
+    """Return the files that a result is computed from: the roots, and every module of this package that they import.
 
+    A recording that does not exist is left out: it has another key once it is there.
+    """
+    waiting = {_module_file(roots.module)}
+    if roots.method:
+        path = (
+            folders.suite / roots.method.rpartition(":")[0] if ".py:" in roots.method else folders.suite / roots.method
+        )
+        waiting.add(path if path.suffix == ".py" else _home_of_method(roots.method))
+    if roots.system:
+        path = folders.suite / roots.system
+        waiting.add(path if path.suffix in (".py", ".toml") else _home_of_system(roots.system))
+    if roots.recording and (folders.data / roots.recording).is_file():
+        waiting.add(folders.data / roots.recording)
+    found: set[Path] = set()
+    while waiting:
+        path = waiting.pop().resolve()
+        if path not in found:
+            found.add(path)
+            waiting |= _imports(path, path.stat().st_mtime_ns)
+    return found
+
+
+@functools.cache
+def _home_of_method(name: str) -> Path:
+    return Path(inspect.getfile(methods.find(name)))
+
+
+@functools.cache
+def _home_of_system(name: str) -> Path:
+    """Return the module that defines a system of this package."""
     for info in pkgutil.iter_modules(systems.__path__):
-        module = importlib.import_module(f"latticebench.systems.{info.name}")
-        if getattr(getattr(module, "SYSTEM", None), "name", None) == system:
-            return module.__name__
-    raise AssertionError(system)
+        module = importlib.import_module(f"{PACKAGE}.systems.{info.name}")
+        if getattr(getattr(module, "SYSTEM", None), "name", None) == name:
+            return Path(inspect.getfile(module))
+    raise unknown("system", name, systems.names())
 
 
 def _module_file(name: str) -> Path:
@@ -61,25 +99,34 @@ def _module_file(name: str) -> Path:
 
 
 @functools.lru_cache(maxsize=1024)
-def _imports(path: Path, changed: int) -> set[Path]:  # noqa: ARG001
-    """Give the files of this project that a file imports, anywhere in it; `changed` renews the memory."""
+def _imports(path: Path, changed: int) -> frozenset[Path]:  # noqa: ARG001
+    """Return the files of this package that a file imports, anywhere in it; `changed` renews the memory."""
     if path.suffix != ".py":
-        return set()
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    files = set()
-    # A package's __init__ looks its modules up by name and computes nothing.
-    for name in names:
-        if name.split(".")[0] == PACKAGE and name.count(".") > 1:
+        return frozenset()
+    text = path.read_text(encoding="utf-8")
+    # A package that looks its modules up uses all of them.
+    found = set(path.parent.glob("*.py")) if path.name == "__init__.py" and "iter_modules" in text else set()
+    for name in _names(ast.parse(text)):
+        parts = name.split(".")
+        # The __init__ of a room looks its modules up by name and computes nothing.
+        for length in range(3, len(parts) + 1 if parts[0] == PACKAGE else 0):
             try:
-                files.add(_module_file(name))
+                found.add(_module_file(".".join(parts[:length])))
             except (ModuleNotFoundError, AssertionError):
-                continue
-    return files
+                # The name of something in a module.
+                break
+    return frozenset(found)
+
+
+def _names(node: ast.AST) -> Iterator[str]:
+    """Return the names that a piece of source may import, but for what only a type checker reads."""
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        yield from (f"{node.module}.{alias.name}" for alias in node.names)
+    only_types = isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+    for child in node.orelse if isinstance(node, ast.If) and only_types else ast.iter_child_nodes(node):
+        yield from _names(child)
 
 
 @functools.lru_cache(maxsize=1024)

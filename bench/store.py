@@ -1,91 +1,241 @@
-"""The store of results: a folder with one JSON file a finished case.
+"""The store of results: one SQLite file in the folder of a run.
 
-    DIR/store.json           which version of the store's form this is
-    DIR/run.json             the suite that was run last: command, settings, and the keys of its cases in their order
-    DIR/cases/KEY.json       one result; KEY is `Case.key`
+    results  one row per finished case: key, identity, kind, case, status, reason, origin, content, history
+    origins  what made results: commit, date, machine and versions, each once
+    suite    the keys of the suite that was run last, in their order
+    about    what else was written down of that run: command, settings
 
-A file appears whole or not at all (written beside its place, synced, renamed), so that a killed run or two runs at once can lose
-nothing and corrupt nothing.
+Each result is committed at once, in a transaction of its own, so that a killed run loses nothing that it had reported, and two runs
+at once harm nothing. The history of a fit, which is most of a result, is read only where it is asked for.
 """
 
 from __future__ import annotations
 
 import json
+import sqlite3
+import weakref
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pydantic
-
-from latticebench.bench.case import blank
-from latticebench.bench.suite import Case
+from latticebench.bench.case import STATUSES, Case
 from latticebench.systems.errors import InputError
-from latticebench.systems.files import write_text
 
-VERSION = 2
-RESULT = blank(Case.model_construct()).keys() | {"made"}
+VERSION = 3
+FILE = "results.sqlite"
+# In the head of the file, by which a store is known: "LtBn".
+APPLICATION = 0x4C74426E
+# Seconds to wait for another run that is writing.
+PATIENCE = 60.0
+# A file with its journal, while it is being made or written.
+OWN_FILES = tuple(FILE + ending for ending in ("", "-wal", "-shm", "-journal"))
+TABLES = """
+CREATE TABLE IF NOT EXISTS origins (number INTEGER PRIMARY KEY, origin TEXT NOT NULL UNIQUE);
+CREATE TABLE IF NOT EXISTS results (
+    key TEXT PRIMARY KEY, identity TEXT NOT NULL, kind TEXT NOT NULL, "case" TEXT NOT NULL, status TEXT NOT NULL,
+    reason TEXT NOT NULL, origin INTEGER NOT NULL REFERENCES origins, content TEXT NOT NULL, history TEXT
+);
+CREATE INDEX IF NOT EXISTS by_identity ON results (identity, key);
+CREATE TABLE IF NOT EXISTS suite (place INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE);
+CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+"""
+CHOOSE = "choose another place with --results"
 
 
 @dataclass(frozen=True)
+class Shard:
+    """Every `step`-th case of a suite, beginning with the `first`-th (from 1)."""
+
+    first: int = 1
+    step: int = 1
+
+    def __post_init__(self) -> None:
+        """Check that there is such a part."""
+        if not 1 <= self.first <= self.step:
+            raise InputError(f"shard {self.first}/{self.step}: write K/N with K from 1 to N, such as 1/10")
+
+
+WHOLE = Shard()
+
+
+@dataclass(frozen=True, eq=False)
 class Store:
-    """A folder of results; `create` and `open_store` make it."""
+    """An open store; `create` and `open_store` make it, and it closes itself when it is no longer used."""
 
-    folder: Path
+    path: Path
+    connection: sqlite3.Connection
 
-    def path(self, key: str) -> Path:
-        """Say where the result of a case lies."""
-        return self.folder / "cases" / f"{key}.json"
+    def __post_init__(self) -> None:
+        """See to it that the file is closed."""
+        weakref.finalize(self, self.connection.close)
 
-    def has(self, key: str) -> bool:
-        """Say whether a case is finished."""
-        return self.path(key).is_file()
+    def put(self, key: str, case: Case, result: Mapping[str, Any], made: Mapping[str, Any]) -> None:
+        """Keep a result at once, in place of an earlier one; the order of its terms is that of the library.
 
-    def put(self, key: str, result: dict[str, Any]) -> None:
-        """Keep a result at once; the order of its terms is that of the library.
+        Args:
+            key: see `bench.source.keys`.
+            case: what was run.
+            result: `status`, `reason` and the names of `case.blank()`.
+            made: see `bench.provenance.origin`.
 
         Raises:
             InputError: it cannot be written (a full disk); earlier results stay as they are.
+            ValueError: it is not a result of such a case.
         """
-        write_text(self.path(key), json.dumps(result, allow_nan=False) + "\n")
+        content = {**result}
+        status, reason = content.pop("status"), content.pop("reason")
+        if status not in STATUSES or content.keys() != case.blank().keys():
+            raise ValueError(f"not a result of {case.title}: status {status!r}, with {sorted(content)}")
+        history = content.pop("history", None)
+        texts = [None if value is None else json.dumps(value, allow_nan=False) for value in (made, content, history)]
+        with self._writing() as cursor:
+            cursor.execute("INSERT OR IGNORE INTO origins (origin) VALUES (?)", texts[:1])
+            cursor.execute(
+                "INSERT OR REPLACE INTO results SELECT ?, ?, ?, ?, ?, ?, number, ?, ? FROM origins WHERE origin = ?",
+                (key, case.identity, case.kind, case.model_dump_json(), status, reason, *texts[1:], texts[0]),
+            )
 
-    def get(self, key: str) -> dict[str, Any]:
-        """Read a result.
+    def plan(self, keys: Mapping[str, str], about: Mapping[str, Any]) -> None:
+        """Write down which suite is run, and remove what an older source made of its cases.
 
-        Raises:
-            InputError: the file is not a result of this version.
+        Args:
+            keys: of the cases, by their identities.
+            about: the command and what else is worth knowing.
         """
-        path = self.path(key)
-        result = _read(path)
-        try:
-            Case.model_validate(result.get("case"))
-        except pydantic.ValidationError:
-            result = {}
-        missing = RESULT - result.keys()
-        if missing:
-            raise InputError(f"{path}: not a result that this version writes; delete it and run the suite again")
-        return result
+        rows = [(place, key, identity) for place, (identity, key) in enumerate(keys.items())]
+        with self._writing() as cursor:
+            # In this connection it hides the table of the file: a run goes by its own plan, whatever another run on the same
+            # store plans meanwhile.
+            cursor.execute(
+                "CREATE TEMP TABLE IF NOT EXISTS suite (place INTEGER PRIMARY KEY, key TEXT UNIQUE, identity TEXT)"
+            )
+            cursor.execute("DELETE FROM temp.suite")
+            cursor.executemany("INSERT INTO temp.suite VALUES (?, ?, ?)", rows)
+            cursor.execute(
+                "DELETE FROM results WHERE key IN (SELECT results.key FROM temp.suite AS planned "
+                "JOIN results USING (identity) WHERE results.key <> planned.key)"
+            )
+            cursor.execute("DELETE FROM main.suite")
+            cursor.execute("INSERT INTO main.suite SELECT place, key FROM temp.suite")
+            cursor.execute("DELETE FROM about")
+            cursor.executemany(
+                "INSERT INTO about VALUES (?, ?)", [(name, json.dumps(value)) for name, value in about.items()]
+            )
 
-    def all(self) -> list[dict[str, Any]]:
-        """Read the finished results of the suite that was run last, in its order.
+    def relabel(self, cases: Mapping[str, Case]) -> None:
+        """Write down cases as they are called and limited in this suite; the keys are those of their results."""
+        with self._writing() as cursor:
+            rows = [(case.model_dump_json(), key) for key, case in cases.items()]
+            cursor.executemany('UPDATE results SET "case" = ? WHERE key = ?', rows)
 
-        Raises:
-            InputError: a file is not a result.
+    def finished(self, key: str | None = None) -> dict[str, tuple[str, str]]:
+        """Return the status and the case, as JSON, of each finished case of the suite that was run last, by its key.
+
+        Args:
+            key: of one case, if not of all.
         """
-        return [self.get(key) for key in self.about().get("keys", []) if self.has(key)]
+        only = ("", ()) if key is None else (" WHERE key = ?", (key,))
+        rows = self.read(f'SELECT key, status, "case" FROM results JOIN suite USING (key){only[0]}', only[1])
+        return {found: (status, case) for found, status, case in rows}
 
-    def paths(self) -> list[Path]:
-        """List the files of the results, in the order of their keys."""
-        # Files that start with a dot are being written.
-        return sorted(path for path in (self.folder / "cases").glob("*.json") if not path.name.startswith("."))
+    def statuses(self, shard: Shard = WHOLE) -> dict[str, int]:
+        """Return how many finished cases of the suite that was run last ended with each status."""
+        query = (
+            "SELECT status, COUNT(*) FROM suite JOIN results USING (key) WHERE place % ? = ? "
+            "GROUP BY status ORDER BY status"
+        )
+        return dict(self.read(query, (shard.step, shard.first - 1)))
 
-    def put_about(self, about: dict[str, Any]) -> None:
-        """Write down which suite is run."""
-        write_text(self.folder / "run.json", json.dumps(about, indent=2, sort_keys=True) + "\n")
+    def kinds(self) -> list[str]:
+        """Return the kinds of the finished cases of the suite that was run last."""
+        return [kind for (kind,) in self.read("SELECT DISTINCT kind FROM suite JOIN results USING (key) ORDER BY kind")]
+
+    def results(self, shard: Shard = WHOLE, kind: str = "%", *, history: bool = False) -> Results:
+        """Return the finished results of the suite that was run last, in its order; each reading reads the store anew.
+
+        Args:
+            shard: the part of the suite.
+            kind: of the cases; all if not given.
+            history: read the histories of fits too; they are None otherwise.
+        """
+        return Results(self, shard, kind, history)
 
     def about(self) -> dict[str, Any]:
-        """Read which suite was run last; empty where none was."""
-        path = self.folder / "run.json"
-        return _read(path) if path.is_file() else {}
+        """Return what was written down of the suite that was run last; empty where none was."""
+        return {name: json.loads(value) for name, value in self.read("SELECT name, value FROM about ORDER BY name")}
+
+    def origins(self) -> list[dict[str, Any]]:
+        """Return what made the results of the suite that was run last: commit, date, machine and versions, each once."""
+        used = "SELECT DISTINCT origin FROM suite JOIN results USING (key)"
+        return [json.loads(text) for (text,) in self.read(f"SELECT origin FROM origins WHERE number IN ({used})")]
+
+    def seeds(self) -> list[int]:
+        """Return the seeds of the finished cases of the suite that was run last."""
+        seed = """json_extract("case", '$.seed')"""
+        rows = self.read(f"SELECT DISTINCT {seed} AS seed FROM suite JOIN results USING (key) ORDER BY seed")
+        return [number for (number,) in rows if number is not None]
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Cursor]:
+        """Write all that the block does, or nothing."""
+        try:
+            with self.connection:
+                yield self.connection.execute("BEGIN IMMEDIATE")
+        except sqlite3.Error as error:
+            raise _unwritable(self.path, error) from None
+
+    def read(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+        """Ask the file.
+
+        Raises:
+            InputError: it is damaged.
+        """
+        try:
+            yield from self.connection.execute(query, values)
+        except sqlite3.Error as error:
+            raise _damaged(self.path, str(error)) from None
+
+
+@dataclass(frozen=True)
+class Results:
+    """Results in the order of their suite, read from the store one after the other each time they are gone through.
+
+    Each is a dictionary: `case`, `identity`, `status`, `reason`, `made`, and the names of the case's `blank`.
+    """
+
+    store: Store
+    shard: Shard
+    kind: str
+    history: bool
+
+    def __len__(self) -> int:
+        """Count them."""
+        return int(next(self._rows("COUNT(*)"))[0])
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Read them.
+
+        Raises:
+            InputError: the store is damaged.
+        """
+        origins = {number: json.loads(text) for number, text in self.store.read("SELECT number, origin FROM origins")}
+        history = "history" if self.history else "NULL"
+        columns = f'key, results.identity, "case", status, reason, origin, content, {history}'
+        for key, identity, case, status, reason, origin, content, past in self._rows(columns):
+            try:
+                found = {"case": json.loads(case), "identity": identity, "status": status, "reason": reason}
+                found.update(json.loads(content), made=origins[origin], history=past and json.loads(past))
+            except (ValueError, TypeError, KeyError):
+                raise _damaged(self.store.path, f"the result {key} is not one") from None
+            yield found
+
+    def _rows(self, columns: str) -> Iterator[tuple[Any, ...]]:
+        query = (
+            f"SELECT {columns} FROM suite JOIN results USING (key) WHERE place % ? = ? AND kind LIKE ? ORDER BY place"
+        )
+        return self.store.read(query, (self.shard.step, self.shard.first - 1, self.kind))
 
 
 def create(folder: Path) -> Store:
@@ -95,52 +245,118 @@ def create(folder: Path) -> Store:
         InputError: the folder holds something else, is of another version, or cannot be written.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: a file, not a folder; choose another place with --results")
-    if not (folder / "store.json").is_file():
-        try:
-            # Another run that is just making the store shows as a file with a dot.
-            if folder.is_dir() and any(
-                not path.name.startswith(".") and path.name != "store.json" for path in folder.iterdir()
-            ):
-                raise InputError(f"{folder}: not a store of results and not empty; choose another place with --results")
-        except OSError as error:
-            raise InputError(f"{folder}: {error.strerror or error}; choose another place with --results") from None
-        write_text(folder / "store.json", json.dumps({"version": VERSION}) + "\n")
-    store = open_store(folder)
+        raise InputError(f"{folder}: a file, not a folder; {CHOOSE}")
+    path = folder / FILE
     try:
-        (folder / "cases").mkdir(exist_ok=True)
+        _refuse_json(folder)
+        if folder.is_dir() and any(one.name not in OWN_FILES for one in folder.iterdir()) and not path.exists():
+            raise InputError(f"{folder}: not a store of results and not empty; {CHOOSE}")
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror or error}; choose another place with --results") from None
-    return store
+        raise InputError(f"{folder}: {error.strerror or error}; {CHOOSE}") from None
+    connection = None
+    try:
+        connection = _connect(path, "rwc")
+        _check(connection, path, fresh=True)
+        _keep_journal(connection)
+        marks = f"PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {VERSION};"
+        connection.executescript(f"BEGIN IMMEDIATE; {TABLES} {marks} COMMIT;")
+    except (sqlite3.Error, InputError) as error:
+        if connection is not None:
+            connection.close()
+        raise (error if isinstance(error, InputError) else _unwritable(path, error)) from None
+    return Store(path, connection)
 
 
 def open_store(folder: Path) -> Store:
-    """Open a store that exists.
+    """Open a store that exists, to read it.
 
     Raises:
-        InputError: there is none, or it is of another version.
+        InputError: there is none, it is damaged, or it is of another version.
     """
-    path = folder / "store.json"
+    _refuse_json(folder)
+    path = folder / FILE
     if not path.is_file():
         raise InputError(
-            f"{folder}: not a store of results (no store.json in it); make one with: latticebench run SUITE --results {folder}"
+            f"{folder}: not a store of results (no {FILE} in it); make one with: latticebench run SUITE --results {folder}"
         )
-    version = _read(path).get("version")
-    if version != VERSION:
-        raise InputError(
-            f"{folder}: a store of version {version!r}, this latticebench reads version {VERSION}; "
-            "run the suite again into another folder with --results, or use the latticebench that made it"
-        )
-    return Store(folder)
-
-
-def _read(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON: {error}; delete it and run the suite again") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: not a result; delete it and run the suite again")
-    return content
+        connection = _connect(path, "rw")
+        try:
+            _check(connection, path)
+        except sqlite3.OperationalError:
+            # A place that cannot be written has no room for the index of a journal, nor does anybody write there.
+            connection.close()
+            if (folder / OWN_FILES[1]).exists():
+                raise
+            connection = _connect(path, "ro&immutable=1")
+            _check(connection, path)
+    except sqlite3.Error as error:
+        raise _damaged(path, str(error)) from None
+    except InputError:
+        connection.close()
+        raise
+    return Store(path, connection)
+
+
+def is_store(folder: Path) -> bool:
+    """Return whether a folder holds a store, be it one that cannot be read."""
+    return (folder / FILE).is_file() or (folder / "store.json").is_file()
+
+
+def _connect(path: Path, mode: str) -> sqlite3.Connection:
+    return sqlite3.connect(f"{path.resolve().as_uri()}?mode={mode}", uri=True, timeout=PATIENCE, isolation_level=None)
+
+
+def _keep_journal(connection: sqlite3.Connection) -> None:
+    """Let readers and a writer not wait for each other; where the file system cannot, SQLite's rollback journal stays."""
+    try:
+        connection.execute("PRAGMA journal_mode = WAL")
+    except sqlite3.OperationalError:
+        connection.execute("PRAGMA journal_mode = DELETE")
+
+
+def _check(connection: sqlite3.Connection, path: Path, *, fresh: bool = False) -> None:
+    """Make sure that a file is a store of this version, or, where it may be fresh, has nothing in it."""
+    try:
+        application, version = (
+            connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
+        )
+        names = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
+    except sqlite3.OperationalError:
+        raise
+    except sqlite3.DatabaseError as error:
+        raise _damaged(path, str(error)) from None
+    if fresh and not names and not application:
+        return
+    if application != APPLICATION:
+        raise InputError(f"{path}: not a store of results; {CHOOSE}")
+    if version != VERSION:
+        raise _other_version(path.parent, version)
+    if not {"results", "origins", "suite", "about"} <= names:
+        raise _damaged(path, "tables are missing")
+
+
+def _refuse_json(folder: Path) -> None:
+    """Refuse a store of JSON files, as there were up to version 2."""
+    if (folder / "store.json").is_file():
+        raise _other_version(folder, "2 or older")
+
+
+def _other_version(folder: Path, version: object) -> InputError:
+    return InputError(
+        f"{folder}: a store of version {version}, this latticebench reads version {VERSION}; "
+        "run the suite again into another folder with --results, or use the latticebench that made it"
+    )
+
+
+def _unwritable(path: Path, error: sqlite3.Error) -> InputError:
+    if not isinstance(error, sqlite3.OperationalError):
+        return _damaged(path, str(error))
+    return InputError(
+        f"{path}: cannot be written: {error}; nothing that was there is lost; is the place full or read-only?"
+    )
+
+
+def _damaged(path: Path, what: str) -> InputError:
+    return InputError(f"{path}: not a store of results that can be read: {what}; delete it and run the suite again")

@@ -1,17 +1,17 @@
-"""Tidy tables of results: one row per case, one row per coefficient, and a summary over seeds."""
+"""Tidy tables of fits: one row per case, one row per coefficient, and a summary over seeds."""
 
 from __future__ import annotations
 
-import io
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from latticebench.bench.suite import Case
+from latticebench.bench.fitting import described
+from latticebench.bench.published import read_table
+from latticebench.bench.store import is_store, open_store
 from latticebench.systems.errors import InputError
 
 SCORES = (
@@ -26,83 +26,88 @@ INTERVAL = 1.96
 ABOUT = ["part", "data", "library"]
 
 
-def cases(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+# Columns of the tables; those that a program reads are the last.
+CASES = (
+    "part", "data", "library", "method", "noise", "seed", "status", *SCORES, "covered", "reason", "settings", "identity",
+)  # fmt: skip
+COEFFICIENTS = (
+    "part", "data", "library", "method", "noise", "seed", "term", "coefficient", "truth", "error", "stderr", "bound", "verdict",
+)  # fmt: skip
+LIMITS = (*ABOUT, "term", "truth", "bound", "verdict")
+
+
+def tables(results: Iterable[Mapping[str, Any]]) -> dict[str, pd.DataFrame]:
+    """Make the tables that `cases`, `coefficients` and `limits` make, reading the results once."""
+    rows: list[tuple[Any, ...]] = []
+    terms: list[tuple[Any, ...]] = []
+    bounds: dict[tuple[str, ...], tuple[Any, ...]] = {}
+    for result in results:
+        head = _head(result["case"])
+        rows.append(_case(head, result))
+        terms += _coefficients(head, result)
+        for about, found in _limits(head, result):
+            # Where the bound depends on the seed, the first one stands for all.
+            bounds.setdefault(about, found)
+    return {
+        "cases": pd.DataFrame(rows, columns=list(CASES)),
+        "coefficients": pd.DataFrame(terms, columns=list(COEFFICIENTS)),
+        "limits": pd.DataFrame([(*about, *found) for about, found in bounds.items()], columns=list(LIMITS)),
+    }
+
+
+def cases(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Make the table of cases: one row each, its settings first.
 
     Scores of a case that gave none are NaN; `status` and `reason` say why. An error that is infinite stays infinite.
     """
-    rows = []
-    for result in results:
-        case = Case.model_validate(result["case"])
-        rows.append(
-            {
-                "part": case.part, "data": case.data, "library": case.library, "method": case.label, "noise": case.noise,
-                "seed": case.seed, "status": result["status"],
-                **{name: _number(result[name]) for name in SCORES}, "covered": _covered(result) if case.noise else np.nan,
-                "reason": result["reason"] or result["note"], "settings": _settings(case.settings), "identity": case.identity,
-            }
-        )  # fmt: skip
-    columns = [
-        "part",
-        "data",
-        "library",
-        "method",
-        "noise",
-        "seed",
-        "status",
-        *SCORES,
-        "covered",
-        "reason",
-        "settings",
-        "identity",
-    ]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame([_case(_head(result["case"]), result) for result in results], columns=list(CASES))
 
 
-def coefficients(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+def coefficients(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Make the table of coefficients: one row each, with truth and error where there are any.
 
     `bound` is the smallest standard error that an unbiased method can have on these samples, `verdict` what follows from it.
     """
-    rows = []
-    for result in results:
-        case = Case.model_validate(result["case"])
-        for term, value in (result["coefficients"] or {}).items():
-            truth = np.nan if result["truth"] is None else result["truth"][term]
-            stderr, bound = (
-                np.nan if result[name] is None else _number(result[name][term]) for name in ("stderr", "bounds")
-            )
-            rows.append(
-                {
-                    "part": case.part, "data": case.data, "library": case.library, "method": case.label,
-                    "noise": case.noise, "seed": case.seed, "term": term, "coefficient": value, "truth": truth, "error": value - truth,
-                    "stderr": stderr, "bound": bound, "verdict": (result["verdicts"] or {}).get(term, ""),
-                }
-            )  # fmt: skip
-    columns = [
-        "part", "data", "library", "method", "noise", "seed", "term", "coefficient", "truth", "error", "stderr", "bound", "verdict",
-    ]  # fmt: skip
-    return pd.DataFrame(rows, columns=columns)
+    return tables(results)["coefficients"]
 
 
-def limits(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Make the table of what can be known: one row for each term of the data and libraries that have a bound.
+def limits(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Make the table of what can be known: one row per term of the data and libraries that have a bound.
 
     `bound` is the smallest standard error of an unbiased method, in units of the coefficient.
     """
-    rows: dict[tuple[str, ...], dict[str, Any]] = {}
-    for result in results:
-        case = Case.model_validate(result["case"])
-        for term, verdict in (result["verdicts"] or {}).items():
-            # Where the bound depends on the seed, the first one stands for all.
-            about = {"part": case.part, "data": case.data, "library": case.library, "term": term}
-            found = {"truth": result["truth"][term], "bound": _number(result["bounds"][term]), "verdict": verdict}
-            rows.setdefault(tuple(about.values()), {**about, **found})
-    return pd.DataFrame(list(rows.values()), columns=[*ABOUT, "term", "truth", "bound", "verdict"])
+    return tables(results)["limits"]
+
+
+def _head(case: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the first columns of both tables: part, data, library, method, noise, seed."""
+    return case["part"], described(case), case["library"], case["label"], case["noise"], case["seed"]
+
+
+def _case(head: tuple[Any, ...], result: Mapping[str, Any]) -> tuple[Any, ...]:
+    case = result["case"]
+    covered = _covered(result) if case["noise"] else np.nan
+    settings = ", ".join(f"{name}={value}" for name, value in case["settings"].items())
+    about = (covered, result["reason"] or result["note"], settings, result["identity"])
+    return (*head, result["status"], *[_number(result[name]) for name in SCORES], *about)
+
+
+def _coefficients(head: tuple[Any, ...], result: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    truths, errors, bounds = (result[name] or {} for name in ("truth", "stderr", "bounds"))
+    verdicts = result["verdicts"] or {}
+    for term, value in (result["coefficients"] or {}).items():
+        truth = truths.get(term, np.nan)
+        known = _number(errors.get(term)), _number(bounds.get(term))
+        yield (*head, term, value, truth, value - truth, *known, verdicts.get(term, ""))
+
+
+def _limits(head: tuple[Any, ...], result: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], tuple[Any, ...]]]:
+    for term, verdict in (result["verdicts"] or {}).items():
+        yield (*head[:3], term), (result["truth"][term], _number(result["bounds"][term]), verdict)
 
 
 def _covered(result: Mapping[str, Any]) -> float:
-    """Give the share of a case's 95 % intervals that hold the truth; NaN without truth or standard errors.
+    """Return the share of a case's 95 % intervals that hold the truth; NaN without truth or standard errors.
 
     Without noise there is nothing that an interval could be of.
     """
@@ -121,7 +126,8 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     A case that failed or ran out of time counts as an infinite error and stays in the median; one that was skipped leaves no
     figure. `ok` counts the cases that ended with a fit. `efficiency` is the Cramer-Rao bound over the root-mean-square of E2
     over the seeds: 1 is the best that an unbiased method can do, a failure makes it 0, and with fewer than FEW seeds it is left
-    out. `coverage` is the share of the 95 % intervals (1.96 standard errors to each side) that hold the truth. A biased method may pass 1 where the samples say little: 0 for every coefficient is never more than 100 % off.
+    out; a biased method may pass 1 where the samples say little, since 0 for every coefficient is never more than 100 % off.
+    `coverage` is the share of the 95 % intervals (1.96 standard errors to each side) that hold the truth.
     """
     if table.empty:
         return pd.DataFrame(columns=[*ABOUT, "method"])
@@ -156,20 +162,12 @@ def read_cases(path: Path) -> pd.DataFrame:
     Raises:
         InputError: there is neither at `path`.
     """
-    if path.is_dir():
-        if (path / "store.json").is_file():
-            from latticebench.bench.store import open_store
-
-            return cases(open_store(path).all())
-        path = path / "cases.csv"
+    if is_store(path):
+        return cases(open_store(path).results(kind="fit"))
+    path = path / "cases.csv" if path.is_dir() else path
     if not path.is_file():
         raise InputError(f"{path}: no such table; give a store of results, a folder with cases.csv, or a cases.csv")
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-        body = itertools.dropwhile(lambda line: line.startswith("#"), lines)
-        table = pd.read_csv(io.StringIO("".join(body)), dtype=str, keep_default_na=False)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a table of cases: {error}") from None
+    table = read_table(path)
     missing = [name for name in ("identity", "status", "e2") if name not in table]
     if missing:
         raise InputError(f"{path}: not a table of cases: the column {missing[0]!r} is missing")
@@ -181,7 +179,3 @@ def read_cases(path: Path) -> pd.DataFrame:
 
 def _number(value: Any) -> float:
     return np.nan if value is None else float(value)
-
-
-def _settings(given: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name}={value}" for name, value in given.items())

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
-    from latticebench.bench.suite import Case
+    from latticebench.bench.fitting import FitCase
     from latticebench.systems.lattice import Library, System
     from latticebench.systems.samples import Samples
 
@@ -44,14 +44,14 @@ def asked(
     return known, candidates, order
 
 
-def case_of(**given: Any) -> Case:
+def case_of(**given: Any) -> FitCase:
     """Check what describes simulated samples."""
     import pydantic
 
-    from latticebench.bench.suite import Case
+    from latticebench.bench.fitting import FitCase
 
     try:
-        return Case(**{"library": "", "label": "", "method": "", **given})
+        return FitCase(**{"library": "", "label": "", "method": "", **given})
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"--{first['loc'][0]}: {first['msg'].lower()}, it is {first['input']!r}") from None
@@ -87,14 +87,6 @@ def numbers(given: Sequence[str] | None) -> dict[str, float]:
         if not math.isfinite(numbers[name]):
             raise InputError(f"--set {name}={value}: {value!r} is not a number")
     return numbers
-
-
-def selected(only: Sequence[str] | None, names: Sequence[str], kind: str) -> Sequence[str]:
-    """Take all names, or those that --only gives."""
-    for name in only or ():
-        if name not in names:
-            raise unknown(kind, name, names, "--only")
-    return only or names
 
 
 @contextmanager

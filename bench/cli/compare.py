@@ -14,16 +14,16 @@ EPILOG = "Example:  latticebench compare results/default runs/default"
 
 
 def compare(
-    old: Annotated[Path, typer.Argument(help="A store, a folder with cases.csv, or a cases.csv.")],
+    old: Annotated[Path, typer.Argument(help="A store, a folder of published tables, or one table.")],
     new: Annotated[Path, typer.Argument(help="The same, to be judged.")],
     factor: Annotated[float, typer.Option(min=1.0, help="An error that grew beyond this factor is a loss.")] = 2.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
 ) -> None:
     """Say which cases got better or worse; exit code 1 when any got worse."""
-    from latticebench.bench.compare import compare as compare_tables
-    from latticebench.bench.tables import read_cases
+    from latticebench.bench.compare import compare as compare_runs
+    from latticebench.bench.compare import read_run
 
-    found = compare_tables(read_cases(old), read_cases(new), factor)
+    found = compare_runs(read_run(old), read_run(new), factor)
     if as_json:
         rows = {"worse": found.worse.to_dict("records"), "better": found.better.to_dict("records")}
         rest = {"same": found.same, "gone": found.gone, "new": found.fresh}
@@ -31,7 +31,7 @@ def compare(
     else:
         for name, frame in (("worse", found.worse), ("better", found.better)):
             for _, row in frame.iterrows():
-                print(f"{name}: {row['case']}: E2 {row['old']} -> {row['new']}")
+                print(f"{name}: {row['case']}: {row['old']} -> {row['new']}")
         for name in found.gone:
             print(f"gone: {name}")
         for name in found.fresh:

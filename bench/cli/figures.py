@@ -7,9 +7,6 @@ from typing import Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import selected
-from latticebench.systems.errors import InputError
-
 EPILOG = "Example:  latticebench figures runs/default --out results/default"
 
 
@@ -20,15 +17,10 @@ def figures(
         list[str] | None, typer.Option(help="Draw this kind of figure alone; may be given several times.")
     ] = None,
 ) -> None:
-    """Draw the results of a run: coefficients against iteration, errors, error against time and noise."""
-    from latticebench.bench.figures import FIGURES, draw_all
-    from latticebench.bench.provenance import describe
+    """Draw the results of a run: coefficients against iteration, errors against time and noise; what was named for what."""
+    from latticebench.bench import kinds
     from latticebench.bench.store import open_store
 
-    chosen = selected(only, FIGURES, "figure")
-    store = open_store(folder)
-    found = store.all()
-    if not found:
-        raise InputError(f"{folder}: there are no results in it yet; run a suite with --results {folder}")
-    for path in draw_all(found, describe(found, store.about()), out if out is not None else folder / "figures", chosen):
+    kinds.check_figures(only)
+    for path in kinds.draw(open_store(folder), folder / "figures" if out is None else out, only):
         print(path)

@@ -99,7 +99,7 @@ def limit(
     else:
         if known is None or system is None:
             raise InputError("give one or more files, or --system: the bound is about samples")
-        from latticebench.bench.case import bound
+        from latticebench.bench.fitting import bound
 
         case = case_of(
             system=system, parameters=numbers(given), sites=sites, initial=initial, library=candidates.name,

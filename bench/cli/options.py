@@ -47,8 +47,7 @@ def complete_recordings(incomplete: str) -> list[str]:
 
 def suite_files() -> list[Path]:
     """Return the files of the suites that come with the package, by name."""
-    here = Path(__file__).parents[1]
-    return sorted((*here.glob("suites/*.toml"), *here.glob("trials/suites/*.toml")), key=lambda path: path.stem)
+    return sorted(Path(__file__).parents[1].glob("suites/*.toml"))
 
 
 SystemName = Annotated[

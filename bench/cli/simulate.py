@@ -37,7 +37,7 @@ def simulate(
 ) -> None:
     """Simulate a system and write samples of it."""
     from latticebench import systems
-    from latticebench.bench.case import samples as make_samples
+    from latticebench.bench.fitting import samples as make_samples
     from latticebench.systems.readers import FORMATS
     from latticebench.systems.writers import write
 

@@ -1,9 +1,8 @@
-"""Tables and pictures of a suite of diagnoses."""
+"""Tables and the picture of trials: how often the diagnosis was right, and what it named instead."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,14 +13,17 @@ from latticebench.bench.provenance import lines
 from latticebench.bench.publish import format_number
 from latticebench.bench.trials.faults import BLIND, FIFTH_BLIND, FOURTH_BLIND, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND
 from latticebench.bench.trials.trial import is_right
-from latticebench.systems.errors import InputError
 from latticebench.systems.files import whole, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+TABLES = ("trials", "summary", "effects")
+FIGURES = ("confusion",)
+# By which a trial is known in a published table.
+SETTINGS = ("system", "effect", "z", "noise", "velocities", "seed")
 COLUMNS = (
-    "system", "effect", "z", "noise", "velocities", "seed", "status", "size", "apart", "verdict", "named", "alike", "right", "extra",
+    *SETTINGS, "status", "size", "apart", "verdict", "named", "alike", "right", "extra",
     "residual_before", "residual_after", "forecast_before", "forecast_after", "forecast_true", "coefficients_before", "coefficients_after",
     "seconds", "cpu_seconds", "message",
 )  # fmt: skip
@@ -30,45 +32,11 @@ APART = 5.0
 TRUE_TIMES = 1.5
 
 
-def is_run(folder: Path) -> bool:
-    """Say whether a folder holds results of diagnoses."""
-    return folder.is_dir() and any(_rows(folder))
+def group_of(effect: str, apart: float) -> str:
+    """Return which trials a trial is counted with.
 
-
-def read(folder: Path) -> list[dict[str, Any]]:
-    """Read the results of a run.
-
-    Raises:
-        InputError: there are none.
+    One from outside the catalogue that an effect of it comes near could be told from that effect by nobody.
     """
-    found = list(_rows(folder))
-    if not found:
-        raise InputError(f"{folder}: there are no diagnoses in it; run a suite of them with --results {folder}")
-    return found
-
-
-def _rows(folder: Path) -> list[dict[str, Any]]:
-    rows = []
-    for path in sorted(folder.glob("*.json")):
-        row = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(row, dict) and ("effect" in row or "terms" in row):
-            rows.append(row)
-    return rows
-
-
-def about(rows: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, Any]:
-    """Describe where results come from: command, commit, machine, versions and seeds."""
-    path = folder / "about.txt"
-    described: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    for name in ("commit", "date", "machine"):
-        described[name] = sorted({str(row["made"][name]) for row in rows})
-    described["versions"] = rows[0]["made"]["versions"]
-    seeds = sorted({int(row["seed"]) for row in rows if "seed" in row})
-    return {**described, "seeds": seeds or [1]}
-
-
-def kind(effect: str, apart: float) -> str:
-    """Sort trials into kinds; one from outside the catalogue that an effect of it comes near could be told from it by nobody."""
     if effect == NONE:
         return "nothing missing"
     if effect in OTHERS:
@@ -81,34 +49,25 @@ def kind(effect: str, apart: float) -> str:
     return "two at once" if "+" in effect else "one effect"
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Give a row a trial."""
-    # Derived here, so that a run is judged by the rule as it stands now.
-    frame = pd.DataFrame([{**row, "right": _judged(row)} if row["status"] == "ok" else row for row in rows])
-    for name in COLUMNS:
-        if name not in frame:
-            frame[name] = None
-    frame = frame.assign(
-        named=[" + ".join(names) if isinstance(names, list) else "" for names in frame["named"]],
-        alike=["; ".join(", ".join(group) for group in groups) if isinstance(groups, list) else "" for groups in frame["alike"]],
-    )  # fmt: skip
-    return (
-        frame[list(COLUMNS)]
-        .sort_values(["system", "effect", "z", "noise", "velocities", "seed"])
-        .reset_index(drop=True)
-    )
-
-
-def _judged(row: Mapping[str, Any]) -> bool:
-    effect = row["effect"]
-    wanted = [] if effect == NONE or effect in OTHERS else effect.split("+")
-    return is_right(wanted, row["named"], row["alike"], row["verdict"], effect)
+def table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Make the table of trials: one row each, its settings first."""
+    rows = []
+    for result in results:
+        row = {**result["case"], **result, "message": result["reason"] or None}
+        if row["status"] == "ok":
+            # Judged here, so that a run is judged by the rule as it stands.
+            row["right"] = is_right(row["effect"], row["named"], row["alike"], row["verdict"])
+        row["named"] = " + ".join(row["named"] or ())
+        row["alike"] = "; ".join(", ".join(group) for group in row["alike"] or ())
+        rows.append({name: row[name] for name in COLUMNS})
+    frame = pd.DataFrame(rows, columns=list(COLUMNS))
+    return frame.sort_values(list(SETTINGS)).reset_index(drop=True)
 
 
 def summary(frame: pd.DataFrame) -> pd.DataFrame:
-    """Give, for each kind of trial, how often the diagnosis was right, and the errors before and after (medians)."""
+    """Return, per group of trials, how often the diagnosis was right, and the medians of errors before and after."""
     ran = frame[frame["status"] == "ok"].assign(
-        kind=lambda f: [kind(effect, apart) for effect, apart in zip(f["effect"], f["apart"], strict=True)]
+        kind=lambda f: [group_of(effect, apart) for effect, apart in zip(f["effect"], f["apart"], strict=True)]
     )
     found = []
     for names, group in ran.groupby(["kind", "z", "noise", "velocities"], sort=True):
@@ -151,22 +110,10 @@ def by_effect(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def confusion(frame: pd.DataFrame, least: float = 10.0) -> Figure:
-    """Draw which effect was named first for each effect that was there; all that were named where only pairs were there."""
+    """Draw which effect was named first per effect that was there; all that were named where only pairs were there."""
     from matplotlib.figure import Figure
 
-    ran = frame[(frame["status"] == "ok") & ((frame["z"] >= least) | (frame["effect"] == NONE))]
-    pairs = ran["effect"].str.contains("+", regex=False)
-    ran = ran if pairs.all() else ran[~pairs]
-    first = [
-        (text if pairs.all() else text.split(" + ")[0]) or verdict
-        for text, verdict in zip(ran["named"], ran["verdict"], strict=True)
-    ]
-    counts = pd.crosstab(ran["effect"], pd.Series(first, index=ran.index))
-    order = [name for name in counts.index if name in counts.columns]
-    rest = [name for name in counts.columns if name not in order]
-    counts = counts.reindex(
-        index=[*order, *(name for name in counts.index if name not in order)], columns=[*order, *rest]
-    )
+    counts = _counts(frame, least)
     share = counts.div(counts.sum(axis=1), axis=0).fillna(0.0)
     # As high as the rows and the names below them need.
     names = max(len(name) for name in counts.columns) if len(counts.columns) else 0
@@ -176,91 +123,95 @@ def confusion(frame: pd.DataFrame, least: float = 10.0) -> Figure:
     axes.set_xticks(np.arange(share.shape[1]), share.columns, rotation=90)
     axes.set_yticks(np.arange(share.shape[0]), share.index)
     for row, column in np.argwhere(counts.fillna(0).to_numpy() > 0):
-        value = counts.iloc[row, column]
-        axes.text(
-            column,
-            row,
-            f"{value:.0f}",
-            ha="center",
-            va="center",
-            fontsize=7,
-            color="white" if share.iloc[row, column] > 0.5 else "black",
-        )
+        colour = "white" if share.iloc[row, column] > 0.5 else "black"
+        text = f"{counts.iloc[row, column]:.0f}"
+        axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
     axes.set_xlabel("named first, or the verdict where nothing was named")
     axes.set_ylabel("what the recording had")
     axes.set_title(f"z of at least {least:g}; numbers of trials")
     return figure
 
 
-def publish(rows: Sequence[Mapping[str, Any]], about: Mapping[str, Any], out: Path) -> list[Path]:
-    """Write the tables as CSV and Markdown, and the picture."""
-    out.mkdir(parents=True, exist_ok=True)
-    made = [row for row in rows if "effect" in row]
-    measured = sorted((row for row in rows if "terms" in row), key=lambda row: str(row["name"]))
-    head = [f"- {line}" for line in lines(about)]
+def _counts(frame: pd.DataFrame, least: float) -> pd.DataFrame:
+    """Count what was named first (columns) per effect (rows), in the same order as far as the names are the same."""
+    ran = frame[(frame["status"] == "ok") & ((frame["z"] >= least) | (frame["effect"] == NONE))]
+    pairs = ran["effect"].str.contains("+", regex=False)
+    ran = ran if pairs.all() else ran[~pairs]
+    first = [
+        (text if pairs.all() else text.split(" + ")[0]) or verdict
+        for text, verdict in zip(ran["named"], ran["verdict"], strict=True)
+    ]
+    counts = pd.crosstab(ran["effect"], pd.Series(first, index=ran.index))
+    order = [name for name in counts.index if name in counts.columns]
+    return counts.reindex(
+        index=[*order, *(name for name in counts.index if name not in order)],
+        columns=[*order, *(name for name in counts.columns if name not in order)],
+    )
+
+
+def publish(
+    results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = TABLES
+) -> list[Path]:
+    """Write the tables as CSV, and the summary as Markdown with its picture.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    frame = table(results)
+    frames = {"trials": frame, "summary": summary(frame), "effects": by_effect(frame)}
+    head = "".join(f"# {line}\n" for line in lines(about))
     written = []
-    if made:
-        frame = table(made)
-        frames = {"trials": frame, "summary": summary(frame), "effects": by_effect(frame)}
-        for name, one in frames.items():
-            path = out / f"{name}.csv"
-            write_text(path, "".join(f"# {line}\n" for line in lines(about)) + one.to_csv(index=False))
-            written.append(path)
-        path = out / "summary.md"
-        parts = ["# Diagnoses", "", *head, "", "How often the diagnosis was right; errors are medians.", "", _markdown(frames["summary"]), "",
-                 "By effect:", "", _markdown(frames["effects"]), "", "![what was named](confusion.png)", ""]  # fmt: skip
+    for name in only:
+        path = folder / f"{name}.csv"
+        write_text(path, head + frames[name].to_csv(index=False))
+        written.append(path)
+    if "summary" in only:
+        path = folder / "summary.md"
+        parts = [
+            "# Diagnoses", "", *(f"- {line}" for line in lines(about)), "",
+            "How often the diagnosis was right; errors are medians.", "", _markdown(frames["summary"]), "",
+            "By effect:", "", _markdown(frames["effects"]), "", "![what was named](confusion.png)", "",
+        ]  # fmt: skip
         write_text(path, "\n".join(parts))
-        written.append(path)
-        with whole(out / "confusion.png") as temporary:
-            confusion(frame).savefig(temporary, format="png", dpi=110)
-        written.append(out / "confusion.png")
-    if measured:
-        path = out / "measured.md"
-        write_text(
-            path,
-            "\n".join(
-                ["# Measured recordings", "", *head, "", *(line for row in measured for line in _recording(row))]
-            ),
-        )
-        written.append(path)
-        for row in measured:
-            if row["status"] == "ok":
-                path = out / f"{row['name']}.json"
-                write_text(path, json.dumps(row["report"], indent=1) + "\n")
-                written.append(path)
+        written += [path, *_save(frame, about, folder)]
     return written
 
 
-def _recording(row: Mapping[str, Any]) -> list[str]:
-    """Write what was found in one recording."""
-    rows = f", rows {row['rows'][0]} to {row['rows'][1]}" if row["rows"] else ""
-    text = [
-        f"## {row['name']}",
-        "",
-        f"`{row['file']}`{rows}. Declared: {row['about']} (`{row['terms']}`, order {row['order']}, ends {row['ends']}).",
-        "",
-    ]
-    if row["status"] != "ok":
-        return [*text, f"{row['status']}: {row['message']}", ""]
-    report = row["report"]
-    text += [f"Verdict: **{report['verdict']}**, {row['seconds']:.0f} s.", ""]
-    for effect in report["effects"]:
-        values = ", ".join(
-            f"{name} {format_number(value)}"
-            for name, value in [*effect["parameters"].items(), *effect["coefficients"].items()]
-            if value is not None
-        )
-        alike = f"; cannot be told from {', '.join(effect['indistinguishable'])}" if effect["indistinguishable"] else ""
-        text.append(f"- {effect['effect']}: {values}{alike}")
-    error = report["error"]
-    text += ["", "| | before | after |", "|---|---|---|"]
-    for name in ("residual", "forecast"):
-        text.append(f"| {name} | {format_number(error[name]['before'])} | {format_number(error[name]['after'])} |")
-    text += ["", "What was tried in each round, the best first (evidence in natural logarithms):", ""]
-    for number, one in enumerate(report["rounds"], start=1):
-        listed = ", ".join(f"{entry['effect']} {entry['evidence']:.0f}" for entry in one["ranking"][:6])
-        text.append(f"{number}. {listed}")
-    return [*text, ""]
+def draw_all(
+    results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = FIGURES
+) -> list[Path]:
+    """Draw what was named for what was there.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    return _save(table(results), about, folder) if only else []
+
+
+def _save(frame: pd.DataFrame, about: Mapping[str, Any], folder: Path) -> list[Path]:
+    if not (frame["status"] == "ok").any():
+        return []
+    path = folder / "confusion.png"
+    with whole(path) as temporary:
+        about_it = {"Description": "\n".join(lines(about)), "Software": "latticebench"}
+        confusion(frame).savefig(temporary, format="png", dpi=110, metadata=about_it)
+    return [path]
+
+
+def show(results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], title: str = "", value: str = "") -> None:  # noqa: ARG001
+    """Print how often the diagnosis was right."""
+    from latticebench.bench.screen import console, show_rows
+
+    if title:
+        console().print(title, style="bold", highlight=False)
+    frame = table(results)
+    short = summary(frame)
+    show_rows(list(short.columns), short.to_numpy().tolist())
+    for _, row in frame[~frame["status"].isin(["ok", "skipped"])].iterrows():
+        line = f"{row['status']}: {row['system']} {row['effect']} z={row['z']:g} seed {row['seed']}: {row['message']}"
+        console().print(line, style="red", highlight=False, markup=False)
+    for line in lines(about):
+        console().print(line, style="dim", highlight=False, markup=False)
 
 
 def _markdown(frame: pd.DataFrame) -> str:

@@ -1,43 +1,21 @@
-"""Suites of diagnoses: recordings made with a known fault, and measured ones.
-
-A suite file (TOML) has a `title` and any number of tables
-
-    [[made]]                       # every combination of the lists is a trial
-    effects = ["catalogue"]        # names; "catalogue": all that make sense; "outside", "blind", "second-blind", "third-blind", "fourth-blind", "fifth-blind": faults that are none of it; "none"; "a+b": two at once
-    systems = ["phi4"]
-    noise = [0.01]
-    z = [5, 10, 30]
-    seeds = [1]
-
-    [[measured]]                   # one recording
-    name = "gliders"
-    file = "gliders.csv"
-    terms = "u[n+1]+u[n-1]-2*u[n]; u[n]"
-    order = 2
-    ends = "fixed"
-
-Each trial's result is a JSON file in the folder of the run, named by a hash of its settings and of the source that computes it, so that
-a run continues where it was stopped.
-"""
+"""Trials as cases: a recording made with a known effect is diagnosed, and the diagnosis compared with what was put in."""
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pydantic
 from threadpoolctl import threadpool_limits
 
 from latticebench import systems
-from latticebench.bench.provenance import origin
+from latticebench.bench.axes import Listed, Seeds
+from latticebench.bench.case import Case, Folders, Number, Roots, Settings
 from latticebench.bench.trials import faults, specimen
 from latticebench.bench.trials.specimen import Specimen
 from latticebench.diagnosis.model import Change
@@ -45,218 +23,172 @@ from latticebench.diagnosis.repair import Diagnosis, diagnose, polish
 from latticebench.diagnosis.residual import alike, forecast, pooled
 from latticebench.diagnosis.tangent import linearise
 from latticebench.diagnosis.ways import ways
+from latticebench.methods.method import Skipped
 from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.files import write_text
-from latticebench.systems.lattice import library
-from latticebench.systems.readers import read
-from latticebench.systems.stencil import Ends
-from latticebench.systems.toml import read_toml
+from latticebench.systems.lattice import System
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-HERE = Path(__file__).parent / "suites"
 # A recording whose effect could not be given its size (it is as good as invisible) is no trial.
 OFF_SIZE = 0.2
 OWN_SIZE = tuple(name for name, fault in faults.FAULTS.items() if not fault.sized)
 KNOWN = tuple(effect.name for effect in CATALOGUE)
 GROUPS = {
-    "catalogue": KNOWN, "outside": tuple(faults.OTHERS), "blind": tuple(faults.BLIND), "second-blind": tuple(faults.SECOND_BLIND),
-    "third-blind": tuple(faults.THIRD_BLIND), "fourth-blind": tuple(faults.FOURTH_BLIND),
-    "fifth-blind": tuple(faults.FIFTH_BLIND),
+    "catalogue": KNOWN, "outside": tuple(faults.OTHERS), "blind": tuple(faults.BLIND),
+    "second-blind": tuple(faults.SECOND_BLIND), "third-blind": tuple(faults.THIRD_BLIND),
+    "fourth-blind": tuple(faults.FOURTH_BLIND), "fifth-blind": tuple(faults.FIFTH_BLIND),
 }  # fmt: skip
+TIME_LIMIT = 1800.0
 
 
-class _Model(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+class Trial(Case):
+    """The diagnosis of a recording with one effect, or with two that have a + between them, of one size.
 
+    Attributes:
+        system: its equation is declared.
+        effect: what the recording has and the equation lacks; "none" for nothing.
+        z: the size of the effect over the smallest standard error that it could be known with.
+        noise: its standard deviation over the RMS of the field about its mean.
+        sites, samples: how many.
+        velocities: whether they are observed.
+        seed: chooses the place of the effect, its times and frequencies, the initial state and the noise.
+    """
 
-class Made(_Model):
-    """A recording to be made: one system, one effect (or two with a + between them) of one size."""
-
+    kind: Literal["trial"] = "trial"
     system: str
     effect: str
-    z: float = 0.0
-    noise: float = 0.01
-    seed: int = 1
-    sites: int = 25
-    samples: int = 50
+    z: Number = 0.0
+    noise: Annotated[float, pydantic.Field(ge=0, allow_inf_nan=False)] = 0.01
+    seed: pydantic.NonNegativeInt = 1
+    sites: pydantic.PositiveInt = 25
+    samples: Annotated[int, pydantic.Field(ge=2)] = 50
     velocities: bool = True
+    time_limit: Annotated[float, pydantic.Field(gt=0, allow_inf_nan=False)] = TIME_LIMIT
 
+    @property
+    def title(self) -> str:
+        """The system, effect, size, noise and seed in one line."""
+        only = "" if self.velocities else " only u"
+        return f"{self.system} noise={self.noise:g}{only} | {self.effect} z={self.z:g} | seed {self.seed}"
 
-class Measured(_Model):
-    """A recording to be read, with the equation that is declared for it."""
+    @property
+    def roots(self) -> Roots:
+        """The diagnosis and the system."""
+        return Roots(__name__, system=self.system)
 
-    name: str
-    about: str
-    file: str
-    rows: tuple[int, int] | None = None
-    terms: str
-    order: Literal[1, 2]
-    ends: Ends = "unknown"
+    def blank(self) -> dict[str, Any]:
+        """Return the names of a result's content; see `run`."""
+        return {
+            "size": None, "apart": None, "about": None, "verdict": None, "named": None, "alike": None, "right": None,
+            "extra": None, "noise_found": None, "noise_true": None, "residual_before": None, "residual_after": None,
+            "forecast_before": None, "forecast_after": None, "coefficients_before": None, "coefficients_after": None,
+            "forecast_true": None, "seconds": None, "cpu_seconds": None,
+        }  # fmt: skip
 
+    def run(self, folders: Folders, found: dict[str, Any]) -> None:
+        """Make the recording, diagnose it, and judge whether the diagnosis is right; see `Case.run`."""
+        system = systems.find(self.system, folders.suite)
+        declared = system.library("equation")
+        one = self.recording(system)
+        wall, cpu = time.perf_counter(), time.process_time()
+        diagnosis = diagnose(
+            declared, system.order, [replace(one.samples, ends=system.ends)], CATALOGUE, self.seed,
+            truth=system.truth(declared, {}),
+        )  # fmt: skip
+        found.update(seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
+        found.update(size=one.z, apart=one.apart, about=dict(one.about), **_errors(diagnosis, one.samples.sigma))
+        course = diagnosis.course
+        named = [change.effect.name for change in course.after.model.changes]
+        alike = [list(names) for names in course.equal]
+        wanted = wanted_names(self.effect)
+        found.update(
+            verdict=course.verdict, named=named, alike=alike,
+            right=is_right(self.effect, named, alike, course.verdict),
+            extra=max(len(named) - max(len(wanted), 1), 0) if wanted else len(named),
+        )  # fmt: skip
+        if self.effect in KNOWN:
+            found["forecast_true"] = _forecast_of_truth(one, diagnosis)
 
-Trial = Made | Measured
+    def recording(self, system: System) -> Specimen:
+        """Make the recording.
 
-
-class _Grid(_Model):
-    effects: list[str]
-    systems: list[str]
-    noise: list[float] = [0.01]
-    z: list[float] = [0.0]
-    seeds: list[Annotated[int, pydantic.Field(ge=0)]] = [1]
-    sites: int = 25
-    samples: int = 50
-    velocities: bool = True
-
-
-class _File(_Model):
-    title: str = ""
-    made: list[_Grid] = []
-    measured: list[Measured] = []
-
-
-def names() -> list[str]:
-    """Name the suites of diagnoses."""
-    return sorted(path.stem for path in HERE.glob("*.toml"))
-
-
-def is_suite(name: str) -> bool:
-    """Say whether a name or a TOML file is a suite of diagnoses."""
-    if not name.endswith(".toml"):
-        return name in names()
-    return bool({"made", "measured"} & set(read_toml(Path(name)))) if Path(name).is_file() else False
-
-
-def load(name: str) -> tuple[str, list[Trial]]:
-    """Load a suite by its name, or from a TOML file: its title and trials.
-
-    Raises:
-        InputError: it is unknown or unsound; the text names the file and the key.
-    """
-    path = Path(name) if name.endswith(".toml") else HERE / f"{name}.toml"
-    if not name.endswith(".toml") and name not in names():
-        raise unknown("suite", name, names())
-    try:
-        file = _File.model_validate(read_toml(path))
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{path}: {place}: {first['msg'][0].lower()}{first['msg'][1:]}") from None
-    trials: list[Trial] = [trial for grid in file.made for trial in _expand(grid, str(path))]
-    return file.title, [*trials, *file.measured]
-
-
-def _expand(grid: _Grid, where: str) -> Iterator[Made]:
-    known = [faults.NONE, *KNOWN, *faults.OTHERS]
-    for system in grid.systems:
-        found = systems.find(system)
-        effects: list[str] = []
-        for name in grid.effects:
-            if name in GROUPS:
-                pool = GROUPS[name]
-                effects += [one for one in pool if faults.sensible(one, found)]
-                continue
-            for part in name.split("+"):
-                if part not in known:
-                    raise unknown("effect", part, known, where)
-            effects.append(name)
-        for noise, z, effect, seed in itertools.product(grid.noise, grid.z, effects, grid.seeds):
-            yield Made(
-                system=system, effect=effect, z=z, noise=noise, seed=seed, sites=grid.sites, samples=grid.samples,
-                velocities=grid.velocities,
+        Raises:
+            Skipped: there is no such effect in this system, or it could not be given the size.
+        """
+        draw = np.random.default_rng([self.seed, zlib.crc32(self.effect.encode())])
+        try:
+            one = specimen.make(
+                system, self.effect, self.z, draw, sites=self.sites, samples=self.samples, noise=self.noise,
+                velocities=self.velocities, variation=True,
             )  # fmt: skip
+        except InputError as error:
+            raise Skipped(str(error)) from None
+        if self.effect != faults.NONE and self.effect not in OWN_SIZE and abs(one.z / self.z - 1) > OFF_SIZE:
+            raise Skipped(f"{self.effect} could not be given the size {self.z:g}: it came out as {one.z:.3g}")
+        return one
 
 
-def key(trial: Trial) -> str:
-    """Give the name under which a trial's result is kept."""
-    root = Path(__file__).resolve().parents[2]
-    source = hashlib.sha256()
-    for folder in ("systems", "methods", "diagnosis", "bench/trials"):
-        for path in sorted((root / folder).rglob("*.py")):
-            if path.name not in ("report.py", "trial.py"):
-                source.update(path.read_bytes())
-    return hashlib.sha256(f"{trial.model_dump_json()}\n{source.hexdigest()}".encode()).hexdigest()[:32]
+class Made(Settings):
+    """A block of trials in a suite: every combination of the lists is one.
 
-
-def run(
-    trials: Sequence[Trial],
-    folder: Path,
-    *,
-    jobs: int = 1,
-    data: Path | None = None,
-    watcher: Callable[[], None] = lambda: None,
-) -> list[dict[str, Any]]:
-    """Run what is not there yet, in `jobs` processes; give all results in the order of the trials.
-
-    Args:
-        trials: of a suite.
-        folder: where results are kept.
-        jobs: processes.
-        data: the folder of measured recordings.
-        watcher: is called after each trial.
+    Attributes:
+        effects: names; "a+b" for two at once, "none" for none, "catalogue" for all of the catalogue that make sense in the
+            system, "outside", "blind", "second-blind", ... for faults outside it.
     """
-    import joblib
 
-    folder.mkdir(parents=True, exist_ok=True)
-    made = origin()
-    places = [folder / f"{key(trial)}.json" for trial in trials]
-    missing = [(trial, place) for trial, place in zip(trials, places, strict=True) if not place.is_file()]
-    for _ in range(len(trials) - len(missing)):
-        watcher()
-    work = (joblib.delayed(_keep)(trial, place, data, made) for trial, place in missing)
-    for _ in joblib.Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)(work):
-        watcher()
-    return [json.loads(place.read_text(encoding="utf-8")) for place in places]
+    part: str = ""
+    effects: Listed[str]
+    systems: Listed[str]
+    noise: Listed[float] = [0.01]
+    z: Listed[float] = [0.0]
+    seeds: Seeds = [1]
+    sites: int = 25
+    samples: int = 50
+    velocities: bool = True
+    time_limit: float = TIME_LIMIT
+    memory_limit: int = 4096
+
+    def cases(self, where: str) -> Iterator[Trial]:
+        """Return every combination.
+
+        Args:
+            where: the place of the block, for errors.
+
+        Raises:
+            InputError: a system or an effect is unknown.
+        """
+        for system in self.systems:
+            effects = _effects(self.effects, system, where)
+            for noise, z, effect, seed in itertools.product(self.noise, self.z, effects, self.seeds):
+                yield Trial(
+                    system=system, effect=effect, z=z, noise=noise, seed=seed, sites=self.sites, samples=self.samples,
+                    velocities=self.velocities, part=self.part, time_limit=self.time_limit,
+                    memory_limit=self.memory_limit,
+                )  # fmt: skip
 
 
-def _keep(trial: Trial, place: Path, data: Path | None, made: Mapping[str, Any]) -> None:
-    """Run one trial and write its result down, a failure too."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    try:
-        row = _made(trial) if isinstance(trial, Made) else _measured(trial, data)
-    except InputError as error:
-        row = {"status": "skipped", "message": str(error)}
-    except Exception as error:
-        row = {"status": "failed", "message": f"{type(error).__name__}: {error}"}
-    row.setdefault("status", "ok")
-    row.setdefault("seconds", time.perf_counter() - wall)
-    row.setdefault("cpu_seconds", time.process_time() - cpu)
-    write_text(place, json.dumps({**trial.model_dump(), **row, "made": made}, indent=1) + "\n")
+def _effects(names: list[str], system: str, where: str) -> list[str]:
+    """Return names of effects with each group written out as those that make sense in a system."""
+    known = [faults.NONE, *KNOWN, *faults.OTHERS]
+    found = systems.find(system)
+    effects: list[str] = []
+    for name in names:
+        if name in GROUPS:
+            effects += [one for one in GROUPS[name] if faults.sensible(one, found)]
+            continue
+        for part in name.split("+"):
+            if part not in known:
+                raise unknown("effect", part, known, where)
+        effects.append(name)
+    return effects
 
 
-def _made(trial: Made) -> dict[str, Any]:
-    """Make a recording, diagnose it, and say whether the diagnosis is right."""
-    system = systems.find(trial.system)
-    draw = np.random.default_rng([trial.seed, zlib.crc32(trial.effect.encode())])
-    one = specimen.make(
-        system, trial.effect, trial.z, draw, sites=trial.sites, samples=trial.samples, noise=trial.noise,
-        velocities=trial.velocities, variation=True,
-    )  # fmt: skip
-    if trial.effect != faults.NONE and trial.effect not in OWN_SIZE and abs(one.z / trial.z - 1) > OFF_SIZE:
-        raise InputError(f"{trial.effect} could not be given the size {trial.z:g}: it came out as {one.z:.3g}")
-    declared = system.library("equation")
-    wall, cpu = time.perf_counter(), time.process_time()
-    found = diagnose(
-        declared, system.order, [replace(one.samples, ends=system.ends)], CATALOGUE, trial.seed,
-        truth=system.truth(declared, {}),
-    )  # fmt: skip
-    seconds, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    own = _forecast_of_truth(one, found) if trial.effect in KNOWN else None
-    named = [change.effect.name for change in found.course.after.model.changes]
-    wanted = [] if trial.effect == faults.NONE or trial.effect in faults.OTHERS else trial.effect.split("+")
-    alike = [list(names) for names in found.course.equal]
-    return {
-        "size": one.z, "apart": one.apart, "about": dict(one.about), "verdict": found.course.verdict, "named": named, "alike": alike,
-        "right": is_right(wanted, named, alike, found.course.verdict, trial.effect),
-        "extra": max(len(named) - max(len(wanted), 1), 0) if wanted else len(named),
-        **_errors(found, one.samples.sigma), "forecast_true": own, "seconds": seconds, "cpu_seconds": cpu,
-    }  # fmt: skip
+def wanted_names(effect: str) -> list[str]:
+    """Return the effects that a right diagnosis names: none where nothing is missing, or nothing that has a name."""
+    return [] if effect == faults.NONE or effect in faults.OTHERS else effect.split("+")
 
 
 def _forecast_of_truth(one: Specimen, found: Diagnosis) -> float | None:
-    """Give the error of forecasts by the true model, fitted to the same data; None where it cannot be set up.
+    """Return the error of forecasts by the true model, fitted to the same data; None where it cannot be set up.
 
     Its effect is put at the place and with the frequency, delay and so on that it was made with; these and its coefficients are then fitted.
     """
@@ -279,13 +211,14 @@ def _forecast_of_truth(one: Specimen, found: Diagnosis) -> float | None:
         return None if fitted is None else pooled(forecast(fitted))
 
 
-def is_right(wanted: list[str], named: list[str], alike: list[list[str]], verdict: str, effect: str) -> bool:
-    """Whether the effect was named first or in the first group, of at most two; two effects in either order.
+def is_right(effect: str, named: list[str], alike: list[list[str]], verdict: str) -> bool:
+    """Return whether the effect was named first or in the first group, of at most two; two effects in either order.
 
     Without an effect nothing may be named; one from outside the catalogue must be seen, and not be explained.
     """
     if effect in faults.OTHERS:
         return verdict in ("unexplained", "partly explained")
+    wanted = wanted_names(effect)
     if not wanted:
         return not named
     groups = [{name, *others} if len(others) <= 1 else {name} for name, others in zip(named, alike, strict=True)]
@@ -306,22 +239,3 @@ def _errors(found: Diagnosis, sigma: float | None) -> dict[str, Any]:
         "coefficients_before": None if found.coefficients is None else found.coefficients[0],
         "coefficients_after": None if found.coefficients is None else found.coefficients[1],
     }  # fmt: skip
-
-
-def _measured(trial: Measured, data: Path | None) -> dict[str, Any]:
-    """Diagnose a measured recording."""
-    from latticebench.bench.report.report import content
-
-    path = (data or Path()) / trial.file
-    samples = read(path, trial.ends)
-    if trial.rows is not None:
-        begin, end = trial.rows
-        samples = [
-            replace(
-                one, t=one.t[begin:end], u=one.u[begin:end], v=None if one.v is None else one.v[begin:end],
-                f=None if one.f is None else one.f[begin:end],
-            )
-            for one in samples
-        ]  # fmt: skip
-    found = diagnose(library("declared", trial.terms), trial.order, samples, CATALOGUE)
-    return {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "report": content(found)}

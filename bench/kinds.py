@@ -1,0 +1,151 @@
+"""The kinds of cases: the one place that knows what each kind's results are shown, published, drawn and compared by.
+
+Modules are imported when a kind is asked for: a suite of fits needs nothing of the diagnosis, and the other way round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from latticebench.bench.provenance import describe
+from latticebench.bench.store import WHOLE, Shard, Store
+from latticebench.systems.errors import InputError, unknown
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from latticebench.bench.store import Results
+
+    Publisher = Callable[["Results", Mapping[str, Any], Path, Sequence[str]], list[Path]]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is made of the results of one kind of case.
+
+    Attributes:
+        tables, figures: names that can be asked for.
+        table: one row per case.
+        show: print results on the screen: results, their description, a title, and which score.
+        publish: write tables: results, their description, the folder, and which tables.
+        draw: the same of figures.
+    """
+
+    tables: Sequence[str]
+    figures: Sequence[str]
+    table: Callable[[Iterable[Mapping[str, Any]]], pd.DataFrame]
+    show: Callable[[Results, Mapping[str, Any], str, str], None]
+    publish: Publisher
+    draw: Publisher
+
+
+def _fit() -> Kind:
+    from latticebench.bench import figures, publish
+    from latticebench.bench.screen import show_results
+    from latticebench.bench.tables import cases
+
+    return Kind(publish.TABLES, figures.FIGURES, cases, show_results, publish.publish, figures.draw_all)
+
+
+def _trial() -> Kind:
+    from latticebench.bench.trials import scores
+
+    return Kind(scores.TABLES, scores.FIGURES, scores.table, scores.show, scores.publish, scores.draw_all)
+
+
+def _measured() -> Kind:
+    from latticebench.bench.trials import findings as found
+
+    return Kind(found.TABLES, found.FIGURES, found.table, found.show, found.publish, found.draw_all)
+
+
+KINDS: Mapping[str, Callable[[], Kind]] = {"fit": _fit, "trial": _trial, "measured": _measured}
+
+
+def each(
+    store: Store, shard: Shard = WHOLE, *, history: bool = False
+) -> Iterator[tuple[str, Kind, Results, dict[str, Any]]]:
+    """Return each kind that a store has: its name, the kind, its results, and their description.
+
+    Raises:
+        InputError: the store has no results yet.
+    """
+    names = store.kinds()
+    if not names:
+        folder = store.path.parent
+        raise InputError(f"{folder}: there are no results in it yet; run a suite with --results {folder}")
+    about = describe(store.origins(), store.about(), store.seeds())
+    for name in names:
+        yield name, KINDS[name](), store.results(shard, name, history=history), about
+
+
+def show(store: Store, title: str = "", value: str = "e2", shard: Shard = WHOLE) -> None:
+    """Print the results of a store."""
+    for _, kind, results, about in each(store, shard):
+        kind.show(results, about, title, value)
+
+
+def rows(store: Store, shard: Shard = WHOLE) -> list[dict[str, Any]]:
+    """Return one row per case, the kinds one after the other."""
+    found = (kind.table(results) for _, kind, results, _ in each(store, shard))
+    return [{str(name): value for name, value in row.items()} for frame in found for row in frame.to_dict("records")]
+
+
+def publish(store: Store, folder: Path, only: Sequence[str] | None = None) -> list[Path]:
+    """Write the tables of a store, or those named; each kind's in a folder of its own where there are several.
+
+    Raises:
+        InputError: the store has no results yet, or a file cannot be written.
+    """
+    several = len(store.kinds()) > 1
+    return [
+        path
+        for name, kind, results, about in each(store)
+        for path in kind.publish(results, about, folder / name if several else folder, _chosen(only, kind.tables))
+    ]
+
+
+def draw(store: Store, folder: Path, only: Sequence[str] | None = None) -> list[Path]:
+    """Draw the figures of a store, or those named; each kind's in a folder of its own where there are several.
+
+    Raises:
+        InputError: the store has no results yet, or a file cannot be written.
+    """
+    several = len(store.kinds()) > 1
+    return [
+        path
+        for name, kind, results, about in each(store, history=True)
+        for path in kind.draw(results, about, folder / name if several else folder, _chosen(only, kind.figures))
+    ]
+
+
+def check_tables(only: Sequence[str] | None) -> None:
+    """Make sure that tables exist.
+
+    Raises:
+        InputError: no kind has a table of such a name.
+    """
+    _check(only, "table", lambda kind: kind.tables)
+
+
+def check_figures(only: Sequence[str] | None) -> None:
+    """Make sure that figures exist.
+
+    Raises:
+        InputError: no kind has a figure of such a name.
+    """
+    _check(only, "figure", lambda kind: kind.figures)
+
+
+def _check(only: Sequence[str] | None, what: str, names: Callable[[Kind], Sequence[str]]) -> None:
+    for name in only or ():
+        known = [one for kind in KINDS.values() for one in names(kind())]
+        if name not in known:
+            raise unknown(what, name, known, "--only")
+
+
+def _chosen(only: Sequence[str] | None, names: Sequence[str]) -> Sequence[str]:
+    return [name for name in names if not only or name in only]

@@ -1,0 +1,118 @@
+"""What the diagnosis found in measured recordings, as a page and as one JSON file per recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from latticebench.bench.provenance import lines
+from latticebench.bench.tables import format_number
+from latticebench.systems.files import write_text
+
+TABLES = ("measured",)
+FIGURES: tuple[str, ...] = ()
+# Entries of a ranking that the page shows.
+SHOWN = 6
+
+
+def table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Make the table of recordings: one row each with the verdict, what was named, and errors before and after."""
+    columns = [
+        "name", "file", "terms", "status", "verdict", "named", "residual_before", "residual_after", "forecast_before",
+        "forecast_after", "seconds", "message",
+    ]  # fmt: skip
+    rows = []
+    for result in results:
+        row = {**result["case"], **result, **summarised(result["report"]), "message": result["reason"]}
+        rows.append({name: row[name] for name in columns})
+    return pd.DataFrame(rows, columns=columns)
+
+
+def summarised(report: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the verdict, the effects that were named, and the errors before and after of a report; None if there is none."""
+    errors = [f"{name}_{when}" for name in ("residual", "forecast") for when in ("before", "after")]
+    if report is None:
+        return dict.fromkeys(["verdict", "named", *errors])
+    found = {name: report["error"][name.split("_")[0]][name.split("_")[1]] for name in errors}
+    return {"verdict": report["verdict"], "named": " + ".join(one["effect"] for one in report["effects"]), **found}
+
+
+def publish(
+    results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = TABLES
+) -> list[Path]:
+    """Write the page, and the report on each recording.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    if not only:
+        return []
+    ordered = sorted(results, key=lambda result: str(result["case"]["name"]))
+    head = [f"- {line}" for line in lines(about)]
+    text = ["# Measured recordings", "", *head, "", *(line for result in ordered for line in _recording(result))]
+    path = folder / "measured.md"
+    write_text(path, "\n".join(text))
+    written = [path]
+    for result in ordered:
+        if result["report"] is not None:
+            path = folder / f"{result['case']['name']}.json"
+            write_text(path, json.dumps(result["report"], indent=1) + "\n")
+            written.append(path)
+    return written
+
+
+def draw_all(
+    results: Iterable[Mapping[str, Any]],  # noqa: ARG001
+    about: Mapping[str, Any],  # noqa: ARG001
+    folder: Path,  # noqa: ARG001
+    only: Sequence[str] = FIGURES,  # noqa: ARG001
+) -> list[Path]:
+    """Draw nothing: the pictures of one recording are those of `latticebench diagnose --html`."""
+    return []
+
+
+def show(results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], title: str = "", value: str = "") -> None:  # noqa: ARG001
+    """Print the verdict on each recording."""
+    from latticebench.bench.screen import console, show_rows
+
+    if title:
+        console().print(title, style="bold", highlight=False)
+    frame = table(results).drop(columns=["file", "terms"])
+    readable = [
+        [format_number(entry) if isinstance(entry, float) else entry for entry in row] for row in frame.to_numpy()
+    ]
+    show_rows(list(frame.columns), readable)
+    for line in lines(about):
+        console().print(line, style="dim", highlight=False, markup=False)
+
+
+def _recording(result: Mapping[str, Any]) -> list[str]:
+    """Write what was found in one recording, as lines of Markdown."""
+    case, report = result["case"], result["report"]
+    rows = f", rows {case['rows'][0]} to {case['rows'][1]}" if case["rows"] else ""
+    declared = f"{case['about']} (`{case['terms']}`, order {case['order']}, ends {case['ends']})"
+    text = [f"## {case['name']}", "", f"`{case['file']}`{rows}. Declared: {declared}.", ""]
+    if report is None:
+        return [*text, f"{result['status']}: {result['reason']}", ""]
+    text += [f"Verdict: **{report['verdict']}**, {result['seconds']:.0f} s.", ""]
+    for effect in report["effects"]:
+        values = ", ".join(
+            f"{name} {format_number(value)}"
+            for name, value in [*effect["parameters"].items(), *effect["coefficients"].items()]
+            if value is not None
+        )
+        alike = f"; cannot be told from {', '.join(effect['indistinguishable'])}" if effect["indistinguishable"] else ""
+        text.append(f"- {effect['effect']}: {values}{alike}")
+    error = report["error"]
+    text += ["", "| | before | after |", "|---|---|---|"]
+    for name in ("residual", "forecast"):
+        text.append(f"| {name} | {format_number(error[name]['before'])} | {format_number(error[name]['after'])} |")
+    text += ["", "What was tried in each round, the best first (evidence in natural logarithms):", ""]
+    for number, one in enumerate(report["rounds"], start=1):
+        listed = ", ".join(f"{entry['effect']} {entry['evidence']:.0f}" for entry in one["ranking"][:SHOWN])
+        text.append(f"{number}. {listed}")
+    return [*text, ""]
