@@ -24,7 +24,7 @@ Number = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 # Where measured recordings lie unless told otherwise.
 DATA = Path("data")
 # Settings that do not decide the result: two cases that differ in these alone are one.
-BESIDES = frozenset(("kind", "label", "part", "time_limit", "memory_limit"))
+BESIDES = {"kind", "label", "part", "time_limit", "memory_limit"}
 _SORTED = json.JSONEncoder(sort_keys=True)
 
 

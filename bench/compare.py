@@ -28,6 +28,8 @@ from latticebench.systems.errors import InputError
 # Round-off differs between machines; errors below this are all the same.
 FLOOR = 1e-9
 FACTOR = 2.0
+NEEDED_OF_FITS = ("identity", "data", "library", "method", "seed", "status", "e2", "residual")
+NEEDED_OF_TRIALS = ("system", "effect", "z", "noise", "velocities", "seed", "status", "right", "residual_after")
 COLUMNS = ("identity", "case", "status", "right", "e2", "residual")
 
 
@@ -56,7 +58,7 @@ def compare(old: pd.DataFrame, new: pd.DataFrame, factor: float = FACTOR, floor:
     `factor`, both counted as at least `floor`; or when it had a result and has none any more.
 
     Args:
-        old: see `read_run`.
+        old: see `read_run` and `of_fits`.
         new: the same, to be judged.
         factor: of two errors that count as the same.
         floor: errors below it are all the same.
@@ -129,21 +131,22 @@ def read_run(path: Path) -> pd.DataFrame:
             f"{path}: no results; give a store of them, a folder of published tables, a cases.csv or a trials.csv"
         )
     frame = read_table(path)
-    if "effect" in frame and "identity" not in frame:
-        return _of_trials(frame)
-    missing = [name for name in ("identity", "status", "e2") if name not in frame]
+    form, needed = (of_trials, NEEDED_OF_TRIALS) if "effect" in frame else (of_fits, NEEDED_OF_FITS)
+    missing = [name for name in needed if name not in frame]
     if missing:
         raise InputError(f"{path}: neither a table of cases nor of trials: the column {missing[0]!r} is missing")
-    return _of_fits(frame)
+    return form(frame)
 
 
-def _of_fits(frame: pd.DataFrame) -> pd.DataFrame:
+def of_fits(frame: pd.DataFrame) -> pd.DataFrame:
+    """Bring a table of cases (`bench.tables`) into the common form."""
     parts = ["data", "library", "method"]
     title = frame[parts[0]].str.cat(frame[parts[1:]], sep=" | ") + " | seed " + frame["seed"].astype(str)
     return _common(frame, identity=frame["identity"], case=title)
 
 
-def _of_trials(frame: pd.DataFrame) -> pd.DataFrame:
+def of_trials(frame: pd.DataFrame) -> pd.DataFrame:
+    """Bring a table of trials (`bench.trials.scores`) into the common form; a trial is known by its settings."""
     told = frame.assign(**{name: pd.to_numeric(frame[name]).map("{:g}".format) for name in ("z", "noise", "seed")})
     seen = np.where(frame["velocities"].astype(str) == "False", " only u", "")
     title = told["system"] + " noise=" + told["noise"] + seen
@@ -152,15 +155,16 @@ def _of_trials(frame: pd.DataFrame) -> pd.DataFrame:
     return _common(frame, identity=title, case=title, right=right, residual=frame["residual_after"])
 
 
-def _of_recordings(frame: pd.DataFrame) -> pd.DataFrame:
+def of_recordings(frame: pd.DataFrame) -> pd.DataFrame:
+    """Bring a table of recordings (`bench.trials.recorded`) into the common form; a recording is known by its name."""
     return _common(frame, identity=frame["name"], case=frame["name"], residual=frame["residual_after"])
 
 
-FORMS = {"fit": _of_fits, "trial": _of_trials, "measured": _of_recordings}
+FORMS = {"fit": of_fits, "trial": of_trials, "measured": of_recordings}
 
 
 def _reports(paths: Iterable[Path]) -> pd.DataFrame:
-    from latticebench.bench.trials.findings import summarised
+    from latticebench.bench.trials.recorded import summarised
 
     rows = []
     for path in paths:
@@ -169,7 +173,7 @@ def _reports(paths: Iterable[Path]) -> pd.DataFrame:
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(f"{path}: not the report on a recording") from None
         rows.append({"name": path.stem, "status": "ok", **found})
-    return _of_recordings(pd.DataFrame(rows))
+    return of_recordings(pd.DataFrame(rows))
 
 
 def _common(frame: pd.DataFrame, **columns: Any) -> pd.DataFrame:

@@ -57,7 +57,7 @@ def _trial() -> Kind:
 
 
 def _measured() -> Kind:
-    from latticebench.bench.trials import findings as found
+    from latticebench.bench.trials import recorded as found
 
     return Kind(found.TABLES, found.FIGURES, found.table, found.show, found.publish, found.draw_all)
 

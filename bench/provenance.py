@@ -41,7 +41,7 @@ def describe(origins: Sequence[Mapping[str, Any]], run: Mapping[str, Any], seeds
         for package, version in one["versions"].items():
             packages.setdefault(package, set()).add(version)
     described["versions"] = {package: " and ".join(sorted(found)) for package, found in packages.items()}
-    described["seeds"] = _ranges(sorted(seeds) or [1])
+    described["seeds"] = sorted(seeds) or [1]
     return described
 
 
@@ -124,7 +124,7 @@ def lines(about: Mapping[str, Any]) -> list[str]:
         if isinstance(value, Mapping):
             value = "; ".join(f"{key} {entry}" for key, entry in value.items())
         elif isinstance(value, (list, tuple)):
-            value = ", ".join(str(entry) for entry in value)
+            value = ", ".join(str(entry) for entry in (_ranges(value) if name == "seeds" else value))
         written.append(f"{name}: {value}")
     return written
 

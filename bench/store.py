@@ -254,17 +254,17 @@ def create(folder: Path) -> Store:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: {error.strerror or error}; {CHOOSE}") from None
-    connection = None
     try:
-        connection = _connect(path, "rwc")
-        _check(connection, path, fresh=True)
-        _keep_journal(connection)
-        marks = f"PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {VERSION};"
-        connection.executescript(f"BEGIN IMMEDIATE; {TABLES} {marks} COMMIT;")
-    except (sqlite3.Error, InputError) as error:
-        if connection is not None:
+        connection = _connect(path, "rwc", fresh=True)
+        try:
+            _keep_journal(connection)
+            marks = f"PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {VERSION};"
+            connection.executescript(f"BEGIN IMMEDIATE; {TABLES} {marks} COMMIT;")
+        except sqlite3.Error:
             connection.close()
-        raise (error if isinstance(error, InputError) else _unwritable(path, error)) from None
+            raise
+    except sqlite3.Error as error:
+        raise _unwritable(path, error) from None
     return Store(path, connection)
 
 
@@ -281,22 +281,15 @@ def open_store(folder: Path) -> Store:
             f"{folder}: not a store of results (no {FILE} in it); make one with: latticebench run SUITE --results {folder}"
         )
     try:
-        connection = _connect(path, "rw")
-        try:
-            _check(connection, path)
-        except sqlite3.OperationalError:
-            # A place that cannot be written has no room for the index of a journal, nor does anybody write there.
-            connection.close()
-            if (folder / OWN_FILES[1]).exists():
-                raise
-            connection = _connect(path, "ro&immutable=1")
-            _check(connection, path)
+        return Store(path, _connect(path, "rw"))
+    except sqlite3.Error as error:
+        # A place that cannot be written has no room for the index of a journal; nor does anybody write there.
+        if not isinstance(error, sqlite3.OperationalError) or (folder / OWN_FILES[1]).exists():
+            raise _damaged(path, str(error)) from None
+    try:
+        return Store(path, _connect(path, "ro&immutable=1"))
     except sqlite3.Error as error:
         raise _damaged(path, str(error)) from None
-    except InputError:
-        connection.close()
-        raise
-    return Store(path, connection)
 
 
 def is_store(folder: Path) -> bool:
@@ -304,8 +297,16 @@ def is_store(folder: Path) -> bool:
     return (folder / FILE).is_file() or (folder / "store.json").is_file()
 
 
-def _connect(path: Path, mode: str) -> sqlite3.Connection:
-    return sqlite3.connect(f"{path.resolve().as_uri()}?mode={mode}", uri=True, timeout=PATIENCE, isolation_level=None)
+def _connect(path: Path, mode: str, *, fresh: bool = False) -> sqlite3.Connection:
+    """Open a file, and make sure that it is a store of this version or, where it may be fresh, has nothing in it."""
+    uri = f"{path.resolve().as_uri()}?mode={mode}"
+    connection = sqlite3.connect(uri, uri=True, timeout=PATIENCE, isolation_level=None)
+    try:
+        _check(connection, path, fresh)
+    except (sqlite3.Error, InputError):
+        connection.close()
+        raise
+    return connection
 
 
 def _keep_journal(connection: sqlite3.Connection) -> None:
@@ -316,17 +317,11 @@ def _keep_journal(connection: sqlite3.Connection) -> None:
         connection.execute("PRAGMA journal_mode = DELETE")
 
 
-def _check(connection: sqlite3.Connection, path: Path, *, fresh: bool = False) -> None:
-    """Make sure that a file is a store of this version, or, where it may be fresh, has nothing in it."""
-    try:
-        application, version = (
-            connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
-        )
-        names = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
-    except sqlite3.OperationalError:
-        raise
-    except sqlite3.DatabaseError as error:
-        raise _damaged(path, str(error)) from None
+def _check(connection: sqlite3.Connection, path: Path, fresh: bool) -> None:
+    application, version = (
+        connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
+    )
+    names = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
     if fresh and not names and not application:
         return
     if application != APPLICATION:

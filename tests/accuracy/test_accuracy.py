@@ -13,11 +13,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from latticebench.bench.compare import compare
+from latticebench.bench.compare import compare, of_fits, read_run
 from latticebench.bench.run import run
 from latticebench.bench.store import create
 from latticebench.bench.suite import load
-from latticebench.bench.tables import cases, read_cases
+from latticebench.bench.tables import cases
 
 BASELINE = Path(__file__).parent / "baseline.csv"
 FACTOR = 2.0
@@ -28,9 +28,9 @@ TITLES = [case.title for case in SUITE.cases]
 
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The baseline and the errors of today."""
+    """The errors of the baseline and of this code."""
     results, _ = run(SUITE, create(tmp_path_factory.mktemp("accuracy") / "store"), jobs=2)
-    return read_cases(BASELINE), cases(results)
+    return read_run(BASELINE), of_fits(cases(results))
 
 
 @pytest.mark.parametrize("number", range(len(TITLES)), ids=TITLES)

@@ -15,6 +15,8 @@ KEPT = ["data", "library", "method", "noise", "seed", "status", "e2", "residual"
 
 if __name__ == "__main__":
     store = open_store(Path(sys.argv[1]))
-    found = store.all()
-    table = cases(found)[KEPT].sort_values(["data", "library", "method"])
-    write_text(Path(__file__).parent / "baseline.csv", render(table, describe(found, store.about()), "csv"))
+    table = cases(store.results())[KEPT].sort_values(["data", "library", "method"])
+    write_text(
+        Path(__file__).parent / "baseline.csv",
+        render(table, describe(store.origins(), store.about(), store.seeds()), "csv"),
+    )

@@ -9,14 +9,14 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from latticebench.bench.case import blank
 from latticebench.bench.figures import draw_all, error_against_noise, panel
-from latticebench.bench.suite import Case
+from latticebench.bench.fitting import FitCase
+from latticebench.bench.worker import outcome
 
 
 def learned() -> dict[str, object]:
-    case = Case(system="phi4", library="lib1", label="net", method="net")
-    made = blank(case)
+    case = FitCase(system="phi4", library="lib1", label="net", method="net")
+    made = {**outcome(case, "ok"), "case": case.model_dump(mode="json"), "identity": case.identity}
     made.update(
         e2=0.01, seconds=3.0, cpu_seconds=2.9, coefficients={"u[n]": 1.9, "u[n]**3": 0.1}, truth={"u[n]": 2.0, "u[n]**3": 0.0},
         history={"step": [0, 10, 20], "seconds": [0, 1, 2], "loss": [3, 2, 1], "coefficients": [[0, 0], [1, 0.3], [1.9, 0.1]]},
@@ -45,7 +45,7 @@ def test_beside_a_panel_stands_what_each_method_ends_with() -> None:
 
 def test_every_figure_is_written_with_its_provenance(tmp_path: Path) -> None:
     other = learned()
-    other["case"] = Case(system="phi4", library="lib1", label="net", method="net", noise=0.1).model_dump(mode="json")
+    other["case"] = FitCase(system="phi4", library="lib1", label="net", method="net", noise=0.1).model_dump(mode="json")
     paths = draw_all([learned(), other], {"command": "latticebench run x", "seeds": [1]}, tmp_path)
     assert {path.name for path in paths} >= {
         "errors.png",

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +15,15 @@ import psutil
 import pytest
 
 from latticebench import systems
-from latticebench.bench.case import run_case
-from latticebench.bench.limit import bound_of
-from latticebench.bench.run import run
-from latticebench.bench.store import create
-from latticebench.bench.suite import Case, Suite, load
-from latticebench.systems.simulate import sample_times, simulate
+from latticebench.bench.case import Folders
+from latticebench.bench.fitting import FitCase
+from latticebench.bench.limit import bound
+from latticebench.bench.run import Tally, run
+from latticebench.bench.store import FILE, Store, create, open_store
+from latticebench.bench.suite import Suite, load
+from latticebench.bench.worker import attempt
+from latticebench.systems.errors import InputError
+from latticebench.systems.simulate import sample_times
 
 HERE = Path(__file__).parent
 posix = pytest.mark.skipif(os.name != "posix", reason="sends POSIX signals")
@@ -40,6 +41,23 @@ def hostile_suite(folder: Path, methods: dict[str, str], *, seeds: str = "[1]", 
     return load(str(folder / "hostile.toml"))
 
 
+def finished(suite: Suite, store: Store, **options: Any) -> tuple[list[dict[str, Any]], Tally]:
+    """Run a suite, and return its results as a list."""
+    results, tally = run(suite, store, **options)
+    return list(results), tally
+
+
+def count(folder: Path) -> int:
+    """Count the results in a store, of whatever suite."""
+    if not (folder / FILE).is_file():
+        return 0
+    try:
+        return int(next(open_store(folder).read("SELECT COUNT(*) FROM results"))[0])
+    except InputError:
+        # It is being made.
+        return 0
+
+
 def diary_lines(path: Path) -> list[str]:
     return path.read_text().splitlines() if path.exists() else []
 
@@ -53,7 +71,7 @@ def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other
         },
         seeds="[1, 2]", limits="time_limit = 8\nmemory_limit = 1500",
     )  # fmt: skip
-    results, tally = run(suite, create(tmp_path / "store"), jobs=2)
+    results, tally = finished(suite, create(tmp_path / "store"), jobs=2)
     found = {(r["case"]["label"], r["case"]["seed"]): r for r in results}
     assert len(found) == tally.ran == 14
     for seed in (1, 2):
@@ -76,7 +94,7 @@ def test_finished_cases_are_not_run_again_and_failures_only_when_asked(tmp_path:
     store = create(tmp_path / "store")
     first, _ = run(suite, store, jobs=1)
     again, tally = run(suite, store, jobs=1)
-    assert again == first == store.all()
+    assert list(again) == list(first) == list(store.results())
     assert (tally.ran, tally.reused) == (0, 2)
     assert len(diary_lines(diary)) == 2
     _, tally = run(suite, store, jobs=1, retry=True)
@@ -87,9 +105,9 @@ def test_finished_cases_are_not_run_again_and_failures_only_when_asked(tmp_path:
 def test_a_raised_time_limit_runs_a_timed_out_case_again(tmp_path: Path) -> None:
     slow = {"slow": "seconds = 1.5"}
     store = create(tmp_path / "store")
-    results, _ = run(hostile_suite(tmp_path / "s", slow, limits="time_limit = 0.5"), store, jobs=1)
+    results, _ = finished(hostile_suite(tmp_path / "s", slow, limits="time_limit = 0.5"), store, jobs=1)
     assert results[0]["status"] == "timeout"
-    results, _ = run(hostile_suite(tmp_path / "s", slow, limits="time_limit = 60"), store, jobs=1)
+    results, _ = finished(hostile_suite(tmp_path / "s", slow, limits="time_limit = 60"), store, jobs=1)
     assert results[0]["status"] == "ok"
 
 
@@ -99,16 +117,16 @@ def test_a_changed_method_is_run_again_and_its_old_result_leaves_the_store(tmp_p
     run(suite, store, jobs=1)
     source = tmp_path / "s" / "hostile.py"
     source.write_text(source.read_text().replace("0.5)", "0.25)"))
-    results, tally = run(load(str(tmp_path / "s" / "hostile.toml")), store, jobs=1)
+    results, tally = finished(load(str(tmp_path / "s" / "hostile.toml")), store, jobs=1)
     assert tally.ran == 1
     assert results[0]["residual"] == 0.25
-    assert len(store.paths()) == 1
+    assert count(tmp_path / "store") == 1
 
 
 def test_the_number_of_jobs_changes_no_digit(tmp_path: Path) -> None:
     suite = load("tiny")
-    one, _ = run(suite, create(tmp_path / "one"), jobs=1)
-    three, _ = run(suite, create(tmp_path / "three"), jobs=3)
+    one, _ = finished(suite, create(tmp_path / "one"), jobs=1)
+    three, _ = finished(suite, create(tmp_path / "three"), jobs=3)
     for a, b in zip(one, three, strict=True):
         assert a["coefficients"] == b["coefficients"]
         assert a["e2"] == b["e2"]
@@ -133,20 +151,19 @@ def test_after_kill_9_of_the_runner_nothing_finished_is_run_again_and_no_worker_
     hostile_suite(tmp_path / "s", {"good": f'seconds = 0.4, diary = "{diary}"'}, seeds=seeds)
     suite_file, store = tmp_path / "s" / "hostile.toml", tmp_path / "store"
     runner = start_run(suite_file, store)
-    wait_for(lambda: len(list((store / "cases").glob("[!.]*.json"))) >= 3)
+    wait_for(lambda: count(store) >= 3)
     workers = psutil.Process(runner.pid).children(recursive=True)
     runner.kill()
     runner.communicate()
-    finished = {path.stem for path in (store / "cases").glob("[!.]*.json")}
+    there = count(store)
     started = len(diary_lines(diary))
     wait_for(lambda: not any(w.is_running() and w.status() != psutil.STATUS_ZOMBIE for w in workers), 20)
     again = start_run(suite_file, store)
     out, err = again.communicate(timeout=120)
     assert again.returncode == 0, err
-    assert f"{8 - len(finished)} run now, {len(finished)} were there".encode() in out
-    assert len(diary_lines(diary)) <= started + 8 - len(finished)
-    for path in (store / "cases").glob("[!.]*.json"):
-        assert json.loads(path.read_text())["status"] == "ok"
+    assert f"{8 - there} run now, {there} were there".encode() in out
+    assert len(diary_lines(diary)) <= started + 8 - there
+    assert open_store(store).statuses() == {"ok": 8}
 
 
 @posix
@@ -166,7 +183,7 @@ def test_ctrl_c_ends_at_once_with_the_finished_cases_kept(tmp_path: Path) -> Non
     hostile_suite(tmp_path / "s", {"good": "seconds = 0.3", "long": "seconds = 100"})
     store = tmp_path / "store"
     runner = start_run(tmp_path / "s" / "hostile.toml", store)
-    wait_for(lambda: len(list((store / "cases").glob("[!.]*.json"))) >= 1)
+    wait_for(lambda: count(store) >= 1)
     workers = psutil.Process(runner.pid).children(recursive=True)
     os.killpg(runner.pid, signal.SIGINT)
     _, err = runner.communicate(timeout=20)
@@ -174,7 +191,7 @@ def test_ctrl_c_ends_at_once_with_the_finished_cases_kept(tmp_path: Path) -> Non
     assert b"Traceback" not in err
     assert b"the same command continues" in err
     wait_for(lambda: not any(w.is_running() and w.status() != psutil.STATUS_ZOMBIE for w in workers), 10)
-    assert len(list((store / "cases").glob("[!.]*.json"))) == 1
+    assert count(store) == 1
 
 
 def test_two_runs_on_one_store_do_not_corrupt_it(tmp_path: Path) -> None:
@@ -184,12 +201,12 @@ def test_two_runs_on_one_store_do_not_corrupt_it(tmp_path: Path) -> None:
         out, err = runner.communicate(timeout=120)
         assert runner.returncode == 0, err
         assert b"10 cases (10 ok)" in out
-    assert len(create(tmp_path / "store").all()) == 10
+    assert len(list(open_store(tmp_path / "store").results())) == 10
 
 
 def test_a_method_that_writes_to_its_samples_harms_no_other(tmp_path: Path) -> None:
     suite = hostile_suite(tmp_path / "s", {"writing": 'deed = "write"', "good": 'deed = "behave"'})
-    results, _ = run(suite, create(tmp_path / "store"), jobs=1)
+    results, _ = finished(suite, create(tmp_path / "store"), jobs=1)
     assert [result["status"] for result in results] == ["failed", "ok"]
     assert "read-only" in results[0]["reason"]
 
@@ -198,29 +215,28 @@ def test_a_table_shows_the_suite_that_was_run_last_and_where_each_result_came_fr
     store = create(tmp_path / "store")
     run(hostile_suite(tmp_path / "s", {"a": "seconds = 0.01"}), store, jobs=1)
     run(hostile_suite(tmp_path / "s", {"a": "seconds = 0.02"}), store, jobs=1, about={"command": "latticebench run s"})
-    assert [result["case"]["settings"] for result in store.all()] == [{"seconds": 0.02}]
-    assert len(store.paths()) == 2
+    assert [result["case"]["settings"] for result in store.results()] == [{"seconds": 0.02}]
+    assert count(tmp_path / "store") == 2
     assert store.about()["command"] == "latticebench run s"
-    assert {"commit", "date", "machine", "versions"} == set(store.all()[0]["made"])
+    assert {"commit", "date", "machine", "versions"} == set(next(iter(store.results()))["made"])
 
 
 def test_a_noisy_case_holds_its_bound_and_one_without_noise_or_truth_none(tmp_path: Path) -> None:
-    def case(**changed: Any) -> Case:
-        return Case(**{
+    def case(**changed: Any) -> FitCase:
+        return FitCase(**{
             "system": "phi4", "sites": 9, "samples": 20, "noise": 0.01, "library": "lib2", "label": "a", "method": "zero", **changed
         })  # fmt: skip
 
-    found = run_case(case(known_ends=True), tmp_path)
+    found = attempt(case(known_ends=True), Folders(tmp_path))
     system = systems.find("phi4")
-    clean = replace(simulate(system, sites=9, times=sample_times(20)), ends=system.ends)
-    direct = bound_of([clean], system.library("lib2"), system.order, noise=0.01)
+    direct = bound(system, system.library("lib2"), sites=9, times=sample_times(20), noise=0.01)
     assert found["bound"] == pytest.approx(direct.relative, rel=1e-6)
     assert list(found["bounds"].values()) == pytest.approx(list(direct.stderr), rel=1e-6)
     assert tuple(found["verdicts"].values()) == direct.verdicts
     # Neither the seed of the noise, nor mirrored samples of the same noise, say more about the coefficients.
-    assert run_case(case(known_ends=True, seed=2, mirror=True), tmp_path)["bound"] == found["bound"]
-    assert run_case(case(), tmp_path)["bound"] > found["bound"]
+    assert attempt(case(known_ends=True, seed=2, mirror=True), Folders(tmp_path))["bound"] == found["bound"]
+    assert attempt(case(), Folders(tmp_path))["bound"] > found["bound"]
     for without in (case(noise=0.0), case(terms=("u[n]",), library="own"), case(sites=301, samples=100, span=1.0)):
-        result = run_case(without, tmp_path)
+        result = attempt(without, Folders(tmp_path))
         assert result["status"] == "ok"
         assert (result["bound"], result["bounds"], result["verdicts"]) == (None, None, None)

@@ -9,20 +9,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from latticebench.bench.case import blank
-from latticebench.bench.compare import compare
+from latticebench.bench.fitting import FitCase
 from latticebench.bench.provenance import describe, origin
 from latticebench.bench.publish import format_number, matrix, publish, render
-from latticebench.bench.suite import Case
 from latticebench.bench.tables import cases, coefficients, limits, read_cases, summary
+from latticebench.bench.worker import outcome
 from latticebench.systems.errors import InputError
 
 ORIGIN = origin()
 
 
 def result(method: str, seed: int, e2: float | str | None, status: str = "ok", library: str = "lib1") -> dict[str, Any]:
-    case = Case(system="phi4", library=library, label=method, method=method, seed=seed)
-    made = {**blank(case, status, "" if status == "ok" else f"{status} it was"), "made": ORIGIN}
+    case = FitCase(system="phi4", library=library, label=method, method=method, seed=seed)
+    about = {"case": case.model_dump(mode="json"), "identity": case.identity, "made": ORIGIN}
+    made = {**outcome(case, status, "" if status == "ok" else f"{status} it was"), **about}
     if status == "ok":
         found = {"u[n]": 1.0, "abs(u[n])": 0.5}
         made.update(
@@ -42,7 +42,7 @@ RESULTS = [
     result("d", 1, "inf"), result("d", 2, 0.1), result("d", 3, 0.1),
     result("a", 1, None, library="lib9"), result("b", 1, None, "failed", library="lib9"),
 ]  # fmt: skip
-ABOUT = describe(RESULTS, {"command": "latticebench run mine", "keys": ["abc"]})
+ABOUT = describe([ORIGIN], {"command": "latticebench run mine"}, [1, 2, 3])
 
 
 def test_one_row_a_case_and_one_row_a_coefficient() -> None:
@@ -171,30 +171,9 @@ def test_a_file_that_is_no_table_of_cases_is_refused(tmp_path: Path) -> None:
         read_cases(tmp_path / "none")
 
 
-def test_comparing_counts_failures_as_losses_and_round_off_as_nothing() -> None:
-    old = cases([result("a", 1, 1e-15), result("b", 1, 0.1), result("c", 1, 0.1), result("d", 1, None, "failed")])
-    new = cases([result("a", 1, 1e-12), result("b", 1, 0.25), result("c", 1, None, "timeout"), result("d", 1, 0.5)])
-    found = compare(old, new, factor=2.0)
-    assert [row.split(" | ")[2] for row in found.worse["case"]] == ["b", "c"]
-    assert [row.split(" | ")[2] for row in found.better["case"]] == ["d"]
-    assert found.same == 1
-    lost = compare(cases([result("a", 1, 0.1)]), cases([result("a", 1, None, "skipped")]))
-    assert len(lost.worse) == 1
-    assert not len(compare(old, old).worse)
-
-
-def test_comparing_names_cases_that_only_one_side_has() -> None:
-    found = compare(
-        cases([result("a", 1, 0.1), result("a", 2, 0.1)]), cases([result("a", 2, 0.1), result("a", 3, 0.1)])
-    )
-    assert [name.split("seed ")[1] for name in found.gone] == ["1"]
-    assert [name.split("seed ")[1] for name in found.fresh] == ["3"]
-
-
 def test_results_of_several_commits_name_them_all() -> None:
-    first, second = result("a", 1, 0.1), result("a", 2, 0.1)
-    first["made"] = {**ORIGIN, "commit": "one", "versions": {"numpy": "1"}}
-    second["made"] = {**ORIGIN, "commit": "two", "versions": {"numpy": "2"}}
+    first = {**ORIGIN, "commit": "one", "versions": {"numpy": "1"}}
+    second = {**ORIGIN, "commit": "two", "versions": {"numpy": "2"}}
     described = describe([first, second], {})
     assert described["commit"] == ["one", "two"]
     assert described["versions"]["numpy"] == "1 and 2"
@@ -206,11 +185,6 @@ def test_a_sharp_sign_in_a_reason_does_not_cut_the_row(tmp_path: Path) -> None:
     read = read_cases(tmp_path)
     assert list(read["identity"]) == list(cases([odd, *RESULTS])["identity"])
     assert read["method"][0] == "nan"
-
-
-def test_tables_without_a_common_case_cannot_be_compared() -> None:
-    with pytest.raises(InputError, match="no case in common"):
-        compare(cases([result("a", 1, 0.1)]), cases([result("b", 1, 0.1)]))
 
 
 def test_the_provenance_names_no_path_and_no_host() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from latticebench.bench.provenance import lines
-from latticebench.bench.tables import format_number
+from latticebench.bench.publish import format_number
 from latticebench.systems.files import write_text
 
 TABLES = ("measured",)
