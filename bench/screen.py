@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from latticebench.bench.report.equation import written
+from latticebench.bench.report.mathematics import written
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -123,6 +123,23 @@ def waiting(text: str) -> Iterator[None]:
 
     with Console(stderr=True).status(text):
         yield
+
+
+@contextmanager
+def watching() -> Iterator[Callable[[str], None]]:
+    """Show on standard error what is being done and for how long, on a terminal; the function takes the text."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    # How many effects will be fitted is not known beforehand: the bar only moves.
+    columns = (BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("starting", total=None)
+        yield lambda text: progress.update(task, description=escape(text))
 
 
 class Bar:

@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 import latticebench
-from latticebench.bench.cli import compare, data, diagnose, figures, fit, limit, listing, run, simulate, table
+from latticebench.bench.cli import compare, data, diagnose, figures, fit, limit, listing, run, schema, simulate, table
 from latticebench.systems.errors import InputError
 
 app = typer.Typer(
@@ -53,6 +53,7 @@ app.command(epilog=table.EPILOG)(table.table)
 app.command(epilog=figures.EPILOG)(figures.figures)
 app.command(epilog=compare.EPILOG)(compare.compare)
 app.command(epilog=limit.EPILOG)(limit.limit)
+app.command(epilog=schema.EPILOG)(schema.schema)
 
 
 def main() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -29,9 +28,12 @@ def data(
         return
     from latticebench.bench.recordings import RECORDINGS
 
-    rows = [dataclasses.asdict(one) for one in RECORDINGS]
     if as_json:
-        print(json.dumps(rows, indent=2))
+        from latticebench.bench.report.document import provenance, to_json
+        from latticebench.bench.report.outputs import ListDocument
+
+        rows = [dataclasses.asdict(one) for one in RECORDINGS]
+        print(to_json(ListDocument(provenance=provenance(), kind="recordings", rows=rows)), end="")
         return
     for one in RECORDINGS:
         print(f"{one.name}: {one.what}")

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import asked, case_of, jsonable, numbers, told
-from latticebench.bench.cli.options import AnyEnds, Settings, complete_libraries, complete_systems
+from latticebench.bench.cli.arguments import asked, case_of, numbers, told
+from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, complete_systems
+from latticebench.bench.cli.options import Library as LibraryName
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
-    from latticebench.bench.limit import Design, Limit
+    from latticebench.bench.fitting import FitCase
+    from latticebench.bench.limit import Limit
     from latticebench.methods.method import Fit
     from latticebench.systems.lattice import Library
     from latticebench.systems.samples import Samples
@@ -38,11 +38,9 @@ def limit(
             help="What moves; with files, where order and libraries come from.", autocompletion=complete_systems
         ),
     ] = None,
-    library: Annotated[
-        str | None, typer.Option(help="A library of the system.", autocompletion=complete_libraries)
-    ] = None,
-    terms: Annotated[str | None, typer.Option(help="Terms of your own, with ; between them.")] = None,
-    order: Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")] = None,
+    library: LibraryName = None,
+    terms: Terms = None,
+    order: Order = None,
     ends: Annotated[
         AnyEnds | None,
         typer.Option(
@@ -61,73 +59,60 @@ def limit(
     trajectories: Annotated[int | None, typer.Option(help="Number of trajectories; 1 if not given.")] = None,
     velocities: Annotated[bool | None, typer.Option(help="Whether velocities are seen (second-order systems).")] = None,
     initial: Annotated[str | None, typer.Option(help="Initial state; the system's first if not given.")] = None,
-    json_out: Annotated[
-        str | None, typer.Option("--json", metavar="OUT", help="Write it as JSON to a file, or - for the screen.")
-    ] = None,
+    json_out: JsonOut = None,
 ) -> None:
-    """Say how well any method could know the coefficients from such samples, and what would be needed for more.
+    """Show how well any method could know the coefficients from such samples, and what would be needed for more.
 
-    Options from --set to --initial are about samples of a system; of recorded ones everything is known but their noise, which
-    is taken from a fit.
+    Options from --set to --initial are about samples of a system; of recorded ones everything is known but their
+    noise, which is taken from a fit.
     """
-    from latticebench.bench.limit import denser, design
-    from latticebench.bench.screen import show_limit, waiting
-    from latticebench.systems.files import write_text
-
     known, candidates, order = asked(system, library, terms, order)
-    only_simulated = {
-        "--set": given, "--sites": sites, "--samples": samples, "--span": span, "--noise": noise,
-        "--trajectories": trajectories, "--velocities": velocities, "--initial": initial,
+    simulated = {
+        "set": given, "sites": sites, "samples": samples, "span": span, "noise": noise,
+        "trajectories": trajectories, "velocities": velocities, "initial": initial,
     }  # fmt: skip
+    described = {name: value for name, value in simulated.items() if value is not None}
     if files:
-        for name, value in only_simulated.items():
-            if value is not None:
-                raise InputError(f"{name}: files are given, whose samples are as they are; leave it out, or the files")
-        from latticebench.systems.readers import read_all
-
-        data = read_all(files, ends or "unknown")
-        with waiting(f"fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
-            fit = _followed(data, candidates, order)
-
-        def bound_at(more: int, longer: int) -> Limit:
-            if longer > 1:
-                raise InputError("nobody knows how the motion goes on after the record")
-            return denser(data, fit, more)
-
-        note = f"{data[0].source}: bound along the motion that {fit.method!r} fits to the samples, with the noise that it leaves"
-        note += "" if fit.status == "ok" else f" ({fit.status})"
+        for name in described:
+            raise InputError(f"--{name}: files are given, whose samples are as they are; leave it out, or the files")
+        note, bound_at = _of_recordings(files, candidates, order, ends or "unknown")
+    elif known is None or system is None:
+        raise InputError("give one or more files, or --system: the bound is about samples")
     else:
-        if known is None or system is None:
-            raise InputError("give one or more files, or --system: the bound is about samples")
-        from latticebench.bench.fitting import bound
-
+        described.pop("set", None)
         case = case_of(
-            system=system, parameters=numbers(given), sites=sites, initial=initial, library=candidates.name,
-            terms=candidates.texts if terms is not None else (), known_ends=ends != "unknown",
-            ends=None if ends == "unknown" else ends,
-            **{
-                name: value for name, value in (
-                    ("samples", samples), ("span", span), ("trajectories", trajectories), ("velocities", velocities),
-                ) if value is not None
-            },
-            noise=0.01 if noise is None else noise,
+            system=system, parameters=numbers(given), library=candidates.name, known_ends=ends != "unknown",
+            terms=candidates.texts if terms is not None else (), ends=None if ends == "unknown" else ends,
+            **{"noise": 0.01, **described},
         )  # fmt: skip
+        note, bound_at = _of_simulated(case)
+    _report(note, bound_at, target, json_out)
 
-        def bound_at(more: int, longer: int) -> Limit:
-            changed = {"samples": case.samples * more * longer, "span": case.span * longer}
-            return bound(case.model_copy(update=changed), Path())
 
-        note = f"{case.data}: bound at the truth of the system"
-    with waiting("taking the bound"):
-        found = bound_at(1, 1)
-        needed = design(bound_at, target=target)
-    content = json.dumps(jsonable(_limit_json(found, needed, note)), indent=2, allow_nan=False) + "\n"
-    if json_out == "-":
-        print(content, end="")
-        return
-    show_limit(found, needed, note)
-    if json_out is not None:
-        write_text(Path(json_out), content)
+# A bound for so many times the samples in the same time, and for a record so many times as long.
+BoundAt = Callable[[int, int], "Limit"]
+
+
+def _of_recordings(files: Sequence[Path], candidates: Library, order: int, ends: AnyEnds) -> tuple[str, BoundAt]:
+    """Return where the bound of recorded samples is taken, and the bound."""
+    from latticebench.bench.limit import denser
+    from latticebench.bench.screen import waiting
+    from latticebench.systems.readers import read_all
+
+    data = read_all(files, ends)
+    with waiting(f"fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
+        fit = _followed(data, candidates, order)
+
+    def bound_at(more: int, longer: int) -> Limit:
+        if longer > 1:
+            raise InputError("nobody knows how the motion goes on after the record")
+        return denser(data, fit, more)
+
+    note = (
+        f"{data[0].source}: bound along the motion that {fit.method!r} fits to the samples, with the noise that it "
+        "leaves"
+    )
+    return note + ("" if fit.status == "ok" else f" ({fit.status})"), bound_at
 
 
 def _followed(data: Sequence[Samples], candidates: Library, order: int) -> Fit:
@@ -140,15 +125,35 @@ def _followed(data: Sequence[Samples], candidates: Library, order: int) -> Fit:
         return solve(method, data, candidates, order, 1)
 
 
-def _limit_json(found: Limit, needed: Design, note: str) -> dict[str, Any]:
-    rows = zip(found.library.texts, found.coefficients, found.stderr, found.errors, found.verdicts, strict=True)
-    return {
-        "about": note, "noise": found.noise, "samples": found.samples, "span": found.span,
-        "conditioning": found.conditioning, "relative": found.relative,
-        "terms": {
-            text: {"coefficient": float(value), "stderr": float(stderr), "error": float(error), "verdict": verdict}
-            for text, value, stderr, error, verdict in rows
-        },
-        "groups": [[found.library.texts[k] for k in group] for group in found.groups],
-        "needed": dataclasses.asdict(needed),
-    }  # fmt: skip
+def _of_simulated(case: FitCase) -> tuple[str, BoundAt]:
+    """Return where the bound of simulated samples is taken, and the bound."""
+    from latticebench.bench.fitting import bound
+
+    def bound_at(more: int, longer: int) -> Limit:
+        changed = {"samples": case.samples * more * longer, "span": case.span * longer}
+        return bound(case.model_copy(update=changed), Path())
+
+    return f"{case.data}: bound at the truth of the system", bound_at
+
+
+def _report(note: str, bound_at: BoundAt, target: float, json_out: str | None) -> None:
+    """Take the bound and show it, or write it as JSON."""
+    from latticebench.bench.limit import design
+    from latticebench.bench.screen import show_limit, waiting
+    from latticebench.systems.files import write_text
+
+    with waiting("taking the bound"):
+        found = bound_at(1, 1)
+        needed = design(bound_at, target=target)
+    if json_out != "-":
+        show_limit(found, needed, note)
+    if json_out is None:
+        return
+    from latticebench.bench.report.document import provenance, to_json
+    from latticebench.bench.report.outputs import limit_document
+
+    text = to_json(limit_document(found, needed, note, provenance([1])))
+    if json_out == "-":
+        print(text, end="")
+    else:
+        write_text(Path(json_out), text)

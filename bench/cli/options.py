@@ -54,3 +54,12 @@ SystemName = Annotated[
     str, typer.Argument(help="A name from `list systems`, or a .py or .toml file.", autocompletion=complete_systems)
 ]
 Settings = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="May be given several times.")]
+SystemOption = Annotated[
+    str | None, typer.Option(help="Take order and libraries from this system.", autocompletion=complete_systems)
+]
+Library = Annotated[str | None, typer.Option(help="A library of the system.", autocompletion=complete_libraries)]
+Terms = Annotated[str | None, typer.Option(help="Terms of your own, with ; between them.")]
+Order = Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")]
+JsonOut = Annotated[
+    str | None, typer.Option("--json", metavar="OUT", help="Write it as JSON to a file, or - for the screen.")
+]

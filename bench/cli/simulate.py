@@ -11,7 +11,10 @@ from latticebench.bench.cli.arguments import case_of, numbers
 from latticebench.bench.cli.options import KnownEnds, Settings, SystemName
 from latticebench.systems.errors import unknown
 
-EPILOG = "Example:  latticebench simulate phi4 --set C=2 --set v=0.5 --sites 31 --samples 50 --noise 0.01 --seed 1 --out phi4.csv"
+EPILOG = (
+    "Example:  latticebench simulate phi4 --set C=2 --set v=0.5 --sites 31 --samples 50 --noise 0.01 --seed 1 "
+    "--out phi4.csv"
+)
 
 
 def simulate(
@@ -53,5 +56,6 @@ def simulate(
     write([one.observed() for one in data], out)
     listed = ", ".join(f"{name}={value:g}" for name, value in found.with_parameters(case.parameters).items())
     print(
-        f"{out}: {found.name} ({listed}), {data[0].sites} sites, {len(data[0].t)} samples x {len(data)} trajectories, noise {noise:g}"
+        f"{out}: {found.name} ({listed}), {data[0].sites} sites, {len(data[0].t)} samples x {len(data)} trajectories, "
+        f"noise {noise:g}"
     )

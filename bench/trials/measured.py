@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal
 import pydantic
 
 from latticebench.bench.case import Case, Folders, Roots
-from latticebench.bench.report.report import content
+from latticebench.bench.report.content import content
+from latticebench.bench.report.document import to_dict
 from latticebench.diagnosis.repair import diagnose
 from latticebench.methods.method import Skipped
 from latticebench.systems.effects import CATALOGUE
@@ -66,7 +67,7 @@ class Measured(Case):
         except InputError as error:
             raise Skipped(str(error)) from None
         found["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-        found["report"] = content(diagnose(library("declared", self.terms), self.order, samples, CATALOGUE))
+        found["report"] = to_dict(content(diagnose(library("declared", self.terms), self.order, samples, CATALOGUE)))
         found.update(seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
 
     def cut(self, samples: Samples) -> Samples:

@@ -85,7 +85,8 @@ def test_a_diagnosis_names_the_effect_and_writes_json_and_a_page(typed, folder: 
     assert (code, err) == (0, "")
     assert out.startswith("What the equation lacks: ")
     found = json.loads((folder / "out" / "found.json").read_text())
-    assert found["verdict"] == "explained"
+    assert (found["schema"], found["verdict"]) == ("latticebench/diagnosis/1", "explained")
+    assert found["provenance"]["command"].startswith("latticebench diagnose damped.csv --system phi4")
     assert "damping" in {found["effects"][0]["effect"], *found["effects"][0]["indistinguishable"]}
     assert "cubic-drag" in {entry["effect"] for entry in found["rounds"][0]["ranking"]}
     assert list(found["declared"]) == ["u[n+1]+u[n-1]-2*u[n]", "u[n]", "u[n]**3"]
@@ -185,7 +186,7 @@ def test_help_loads_nothing_heavy() -> None:
         "import sys; sys.argv = ['latticebench', *{command!r}]\n"
         "from latticebench.bench.cli import main\n"
         "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
-        "heavy = {{'torch', 'pysindy', 'sympy', 'pandas', 'scipy', 'matplotlib', 'sklearn'}} & set(sys.modules)\n"
+        "heavy = {{'torch', 'pysindy', 'sympy', 'pandas', 'scipy', 'matplotlib', 'sklearn', 'jinja2'}} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     for command in (["diagnose", "--help"], ["data"], ["data", "--json"], ["data", "take", "--help"]):

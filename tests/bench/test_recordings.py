@@ -58,7 +58,7 @@ def test_the_list_is_text_for_people_and_json_for_programs(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert typed(monkeypatch, "data", "--json") == 0
-    rows = json.loads(capsys.readouterr().out)
+    rows = json.loads(capsys.readouterr().out)["rows"]
     assert typed(monkeypatch, "data") == 0
     shown = capsys.readouterr().out
     assert [row["name"] for row in rows] == [one.name for one in RECORDINGS]

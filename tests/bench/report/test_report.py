@@ -7,24 +7,31 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-import pydantic
 import pytest
 
 from latticebench import systems
-from latticebench.bench.report import mathml, report
+from latticebench.bench.report import pictures, rows
+from latticebench.bench.report.content import DiagnosisDocument, content, diagnosis_document
+from latticebench.bench.report.curves import curves
+from latticebench.bench.report.document import Provenance, to_dict, to_json
+from latticebench.bench.report.equation import equation
+from latticebench.bench.report.findings import added
+from latticebench.bench.report.notes import notes, strays
 from latticebench.bench.report.page import page, write_page
+from latticebench.bench.report.separation import separation
+from latticebench.bench.report.text import show
+from latticebench.bench.report.whereabouts import scaled_residuals, spectrum, whereabouts
 from latticebench.bench.trials.specimen import make
 from latticebench.diagnosis.repair import Diagnosis, diagnose
 from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
-from latticebench.systems.terms import Term
 
 BROWSER = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
@@ -66,87 +73,31 @@ def rough() -> Diagnosis:
     specimen = make(systems.find("phi4"), "damping", 40, np.random.default_rng(3), sites=9, samples=40)
     draw = np.random.default_rng(1)
     data = []
-    for rows in (np.arange(40), np.sort(draw.choice(40, 33, replace=False))):
-        u, v = specimen.samples.u[rows].copy(), specimen.samples.v[rows].copy()  # type: ignore[index]
+    for kept in (np.arange(40), np.sort(draw.choice(40, 33, replace=False))):
+        u, v = specimen.samples.u[kept].copy(), specimen.samples.v[kept].copy()  # type: ignore[index]
         u[draw.random(u.shape) < 0.1] = v[draw.random(v.shape) < 0.1] = np.nan
         u[:, 3] = np.nan
-        data.append(Samples(specimen.samples.t[rows], u, v, source=f"part {len(data) + 1}.csv", ends="free"))
+        data.append(Samples(specimen.samples.t[kept], u, v, source=f"part {len(data) + 1}.csv", ends="free"))
     return diagnose(systems.find("phi4").library("equation"), 2, data, CATALOGUE)
 
 
-class Strict(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+@pytest.fixture(scope="module")
+def about() -> Provenance:
+    return Provenance(command="latticebench diagnose", commit="c", date="d", machine="m", versions={}, seeds=[1])
 
 
-class Pair(Strict):
-    before: float | None
-    after: float | None
-
-
-class Effect(Strict):
-    effect: str
-    parameters: dict[str, float | int | str | bool]
-    coefficients: dict[str, float]
-    stderr: dict[str, float]
-    indistinguishable: list[str]
-
-
-class Entry(Strict):
-    effect: str
-    evidence: float
-    p: float = pydantic.Field(ge=0, le=1)
-    named: bool
-
-
-class Turn(Strict):
-    added: str | None
-    ranking: list[Entry]
-
-
-class Errors(Strict):
-    residual: Pair
-    forecast: Pair
-    coefficients: Pair | None
-    criterion: Pair
-    dynamics: Pair
-
-
-class Left(Strict):
-    effect: str
-    p: float
-    named: bool
-
-
-class Rival(Strict):
-    name: str
-    lead: float = pydantic.Field(gt=0)
-
-
-class Report(Strict):
-    declared: dict[str, float]
-    declared_before: dict[str, float]
-    declared_stderr: dict[str, float]
-    declared_stderr_before: dict[str, float]
-    noise: float = pydantic.Field(gt=0)
-    verdict: Literal["nothing missing", "explained", "partly explained", "unexplained"]
-    effects: list[Effect]
-    rounds: list[Turn]
-    error: Errors
-    where: dict[
-        Literal["before", "after"], dict[Literal["sites", "times", "frequencies"], list[dict[str, float | int]]]
-    ]
-    left: list[Left]
-    rival: Rival | None
-    notes: list[str]
+def page_of(diagnosis: Diagnosis, about: Provenance | None = None) -> str:
+    return page(content(diagnosis), curves(diagnosis), about)
 
 
 @pytest.mark.parametrize("which", ["damped", "driven", "pendulum", "rough"])
-def test_the_json_has_the_promised_form_and_no_numbers_that_json_lacks(
-    which: str, request: pytest.FixtureRequest
+def test_the_json_has_the_published_form_and_no_numbers_that_json_lacks(
+    which: str, request: pytest.FixtureRequest, about: Provenance, conforms: Callable[[str, str], object]
 ) -> None:
     diagnosis: Diagnosis = request.getfixturevalue(which)
-    text = json.dumps(report.content(diagnosis), allow_nan=False)
-    found = Report.model_validate_json(text)
+    text = to_json(diagnosis_document(content(diagnosis), about))
+    conforms("diagnosis", text)
+    found = DiagnosisDocument.model_validate_json(text)
     assert list(found.declared) == list(diagnosis.course.after.model.declared.texts)
     for turn in found.rounds:
         evidence = [entry.evidence for entry in turn.ranking]
@@ -155,15 +106,15 @@ def test_the_json_has_the_promised_form_and_no_numbers_that_json_lacks(
 
 
 def test_what_was_added_is_given_with_its_size_error_and_doubles(damped: Diagnosis) -> None:
-    found = report.content(damped)
-    (effect,) = found["effects"]
-    assert found["verdict"] == "explained"
-    assert {effect["effect"], *effect["indistinguishable"]} >= {"damping"}
-    (value,), (error,) = effect["coefficients"].values(), effect["stderr"].values()
+    found = content(damped)
+    (effect,) = found.effects
+    assert found.verdict == "explained"
+    assert {effect.effect, *effect.indistinguishable} >= {"damping"}
+    (value,), (error,) = effect.coefficients.values(), effect.stderr.values()
     assert value < 0
     assert 5 < -value / error < 100
-    assert found["error"]["residual"]["after"] == pytest.approx(1, abs=0.1)
-    assert found["error"]["criterion"]["after"] < 0
+    assert found.error.residual.after == pytest.approx(1, abs=0.1)
+    assert found.error.criterion.after < 0
 
 
 def test_the_noise_of_a_complex_field_is_that_of_both_parts_together(driven: Diagnosis) -> None:
@@ -171,11 +122,11 @@ def test_the_noise_of_a_complex_field_is_that_of_both_parts_together(driven: Dia
     assert sigma.is_complex
     studied = systems.find("dnls")
     specimen = make(studied, "drive", 30, np.random.default_rng(3), sites=9, samples=40)
-    assert report.content(driven)["noise"] == pytest.approx(specimen.samples.sigma, rel=0.1)
+    assert content(driven).noise == pytest.approx(specimen.samples.sigma, rel=0.1)
 
 
 def test_a_drive_has_its_frequency_among_the_parameters_with_an_error(driven: Diagnosis) -> None:
-    (effect,) = report.added(driven)
+    (effect,) = added(driven)
     assert effect.effect == "drive"
     assert effect.parameters["omega"] > 0
     assert 0 < effect.stderr["omega"] < 0.2 * effect.parameters["omega"]
@@ -184,23 +135,25 @@ def test_a_drive_has_its_frequency_among_the_parameters_with_an_error(driven: Di
 
 def test_a_mass_is_said_as_site_scale_and_ratio() -> None:
     diagnosis = diagnosed("phi4", "unequal-masses", 30)
-    (effect,) = report.added(diagnosis)
+    (effect,) = added(diagnosis)
     assert effect.effect == "unequal-masses"
     assert effect.parameters["site"] == 3
     assert effect.parameters["mass_ratio"] == pytest.approx(1 / (1 + effect.parameters["scale"]))
     assert effect.stderr["mass_ratio"] > 0
-    assert any(line.startswith("site 3: its whole right-hand side") for line in report.equation(diagnosis.course.after))
+    assert any(
+        line.startswith("site 3: its whole right-hand side") for line in equation(diagnosis.course.after).elsewhere
+    )
 
 
 def test_a_sensor_is_named_by_the_column_of_the_file() -> None:
     diagnosis = diagnosed("phi4", "sensor-offset", 30)
-    (effect,) = report.added(diagnosis)
+    (effect,) = added(diagnosis)
     assert list(effect.coefficients) == ["offset of u3"]
     assert effect.parameters == {"site": 3}
 
 
 def test_readings_on_a_grid_are_noted_with_what_rounding_does_to_the_noise(pendulum: Diagnosis) -> None:
-    (note,) = [line for line in report.notes(pendulum) if "multiples" in line]
+    (note,) = [line for line in notes(pendulum) if "multiples" in line]
     share = float(re.search(r"makes ([\d.]+) %", note)[1])  # type: ignore[index]
     noise = float(pendulum.noise[0])
     assert "0.01" in note
@@ -210,7 +163,7 @@ def test_readings_on_a_grid_are_noted_with_what_rounding_does_to_the_noise(pendu
 @pytest.mark.parametrize(("order", "is_complex"), [(2, False), (1, True), (1, False)])
 def test_every_pair_of_effects_has_a_measurement_that_would_separate_it(order: int, is_complex: bool) -> None:
     for one, other in itertools.combinations(CATALOGUE, 2):
-        said = report.separation(one, other, order, is_complex)
+        said = separation(one, other, order, is_complex)
         assert said
         assert said[0].islower()
         assert not said.endswith(".")
@@ -231,54 +184,26 @@ def test_every_pair_of_effects_has_a_measurement_that_would_separate_it(order: i
 )
 def test_what_would_separate_two_effects_follows_from_how_they_act(one: str, other: str, words: str) -> None:
     for pair in ((one, other), (other, one)):
-        assert words in report.separation(find(pair[0]), find(pair[1]), 2, False)
+        assert words in separation(find(pair[0]), find(pair[1]), 2, False)
 
 
 def test_a_residual_that_is_noise_lives_nowhere_and_one_at_a_site_lives_there(damped: Diagnosis) -> None:
-    after = report.whereabouts(damped.course.after, damped)
+    after = whereabouts(damped.course.after, damped)
     assert len(after.sites) + len(after.times) + len(after.frequencies) <= 1
     defect = diagnosed("phi4", "defect", 40)
-    before = report.whereabouts(defect.course.before, defect)
-    assert before.sites[0][0] == report.added(defect)[0].parameters["site"]
-    assert f"site {before.sites[0][0]}" in report.living(before)[0]
+    before = whereabouts(defect.course.before, defect)
+    assert before.sites[0].site == added(defect)[0].parameters["site"]
+    assert f"site {before.sites[0].site}" in before.words[0]
 
 
 def test_the_terminal_shows_equation_ranking_errors_and_what_would_separate(
     damped: Diagnosis, capsys: pytest.CaptureFixture[str]
 ) -> None:
     alike = replace(damped, course=replace(damped.course, equal=(("quadratic-drag",),)))
-    report.show(alike)
+    show(content(alike))
     out = capsys.readouterr().out
     for words in ("u'' = ", "*v[n]", "Round 1: added", "residual over the noise", "cannot be told from", "truth"):
         assert words in out
-
-
-# MathML ---------------------------------------------------------------------------------------------------------------------------
-
-
-def test_a_term_is_written_with_its_indices_and_without_what_browsers_lack() -> None:
-    text = mathml.term("u[n+1]+u[n-1]-2*u[n]")
-    assert text.count("<msub>") == 3
-    assert "<mo>+</mo><mn>1</mn>" in text
-    assert "menclose" not in mathml.term("conj(u[n])**2")
-    assert "<mfrac>" not in mathml.term("cos(1.7*t)*u[n]")
-    assert "1.7" in mathml.term("cos(1.7*t)*u[n]")
-
-
-def test_every_term_of_the_catalogue_can_be_written() -> None:
-    from xml.etree import ElementTree
-
-    for effect in CATALOGUE:
-        for order, is_complex in ((1, True), (2, False)):
-            for text in effect.texts(order, is_complex):
-                bare = mathml.term(text).replace("&InvisibleTimes;", "")
-                assert ElementTree.fromstring(bare) is not None
-                assert Term(text)
-
-
-@pytest.mark.parametrize("value", [0.5, 1.2e-7, 3e9])
-def test_numbers_have_powers_of_ten_where_needed(value: float) -> None:
-    assert ("<msup>" in mathml.number(value)) == (value != 0.5)
 
 
 # The page -------------------------------------------------------------------------------------------------------------------------
@@ -341,7 +266,7 @@ def test_the_page_shows_all_figures_and_equations_in_a_browser(
     which: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     diagnosis: Diagnosis = request.getfixturevalue(which)
-    found = measured(page(diagnosis, {"seed": 1}), tmp_path / "page.html", extra=("--window-size=1000,900",))
+    found = measured(page_of(diagnosis), tmp_path / "page.html", extra=("--window-size=1000,900",))
     cured = bool(diagnosis.course.after.model.changes)
     assert len(found["figures"]) == (5 if cured else 4)  # type: ignore[arg-type]
     for width, height in found["figures"]:  # type: ignore[attr-defined]
@@ -350,7 +275,7 @@ def test_the_page_shows_all_figures_and_equations_in_a_browser(
     for width, height in [*found["math"], *found["images"]]:  # type: ignore[misc]
         assert width > 5
         assert height > 5
-    for words in (report.sentence(diagnosis), "Ranked causes", "Round 1", "residual over the noise"):
+    for words in (content(diagnosis).sentence, "Ranked causes", "Round 1", "residual over the noise"):
         assert words in found["text"]  # type: ignore[operator]
     assert found["scripts"] == 1
 
@@ -358,7 +283,7 @@ def test_the_page_shows_all_figures_and_equations_in_a_browser(
 def test_the_page_fits_a_phone(damped: Diagnosis, tmp_path: Path) -> None:
     # A window of Chromium's is at least 500 wide; a frame is as narrow as it is told to be.
     inner = tmp_path / "inner.html"
-    write_page(damped, {"seed": 1}, inner)
+    write_page(content(damped), curves(damped), None, inner)
     outer = tmp_path / "outer.html"
     outer.write_text(
         f"<iframe id=f src='{inner.as_uri()}' style='width:360px;height:800px;border:0'></iframe>"
@@ -370,8 +295,9 @@ def test_the_page_fits_a_phone(damped: Diagnosis, tmp_path: Path) -> None:
     assert int(title[1]) <= 360
 
 
-def test_no_script_from_a_name_survives_on_the_page(damped: Diagnosis, tmp_path: Path) -> None:
-    text = page(renamed(damped, EVIL), {"command": f"latticebench diagnose {EVIL}", "seed": 1})
+def test_no_script_from_a_name_survives_on_the_page(damped: Diagnosis, about: Provenance, tmp_path: Path) -> None:
+    about = about.model_copy(update={"command": f"latticebench diagnose {EVIL}"})
+    text = page_of(renamed(damped, EVIL), about)
     assert "<script" not in text
     assert "<img" not in text
     found = measured(text, tmp_path / "page.html")
@@ -382,7 +308,7 @@ def test_no_script_from_a_name_survives_on_the_page(damped: Diagnosis, tmp_path:
 
 
 def test_the_page_lets_nothing_run_or_load(damped: Diagnosis, tmp_path: Path) -> None:
-    text = page(damped, {"seed": 1})
+    text = page_of(damped)
     # Even a script that got in would not run.
     (tmp_path / "page.html").write_text(text.replace("</body>", "<script>document.title='owned'</script></body>"))
     assert "<title>owned</title>" not in browsed(tmp_path / "page.html")
@@ -395,85 +321,81 @@ def test_the_page_lets_nothing_run_or_load(damped: Diagnosis, tmp_path: Path) ->
 def test_pieces_of_a_trajectory_are_put_together_and_trajectories_are_not(
     rough: Diagnosis, pendulum: Diagnosis
 ) -> None:
-    found = report.over_noise(rough.course.before, rough)
+    found = scaled_residuals(rough.course.before, rough)
     assert [len(t) for t, _ in found] == [40, 33]
     for side in (pendulum.course.before, pendulum.course.after):
-        ((t, left),) = report.over_noise(side, pendulum)
+        ((t, left),) = scaled_residuals(side, pendulum)
         assert len(t) == len(left) == sum(len(samples.t) for samples in side.data)
         assert np.all(np.diff(t) > 0)
-    assert "in 2 trajectories" in page(rough, {})
-    assert "trajectories" not in page(pendulum, {})
+    assert "in 2 trajectories" in page_of(rough)
+    assert "trajectories" not in page_of(pendulum)
 
 
 def test_the_page_says_what_cannot_be_told_apart_and_what_would_separate_it(damped: Diagnosis) -> None:
     alike = replace(damped, course=replace(damped.course, equal=(("quadratic-drag", "dry-friction"),)))
-    text = page(alike, {})
+    text = page_of(alike)
     assert text.count("cannot be told from") == 2
     assert "damping (or quadratic-drag, dry-friction)" in text
-    assert "cannot be told" not in page(replace(damped, course=replace(damped.course, equal=((),))), {})
+    assert "cannot be told" not in page_of(replace(damped, course=replace(damped.course, equal=((),))))
 
 
 def test_an_effect_that_was_taken_away_again_is_noted(damped: Diagnosis) -> None:
     first, *rest = damped.course.rounds
     course = replace(damped.course, rounds=(replace(first, added="kick"), first, *rest))
-    assert any("taken away again" in note and "kick" in note for note in report.notes(replace(damped, course=course)))
-    assert not any("taken away again" in note for note in report.notes(damped))
+    assert any("taken away again" in note and "kick" in note for note in notes(replace(damped, course=course)))
+    assert not any("taken away again" in note for note in notes(damped))
 
 
 def test_a_forecast_that_runs_away_is_said_to_and_hides_no_readings(damped: Diagnosis) -> None:
     before = [replace(one, predicted=np.full_like(one.predicted, np.inf), error=np.inf) for one in damped.forecasts[0]]
     away = replace(damped, forecasts=(before, damped.forecasts[1]))
-    assert report.errors(away)[2][:2] == ("forecast error on held-out data", "diverges")
-    assert report.content(away)["error"]["forecast"]["before"] is None
-    assert "<svg" in page(away, {})
+    assert rows.errors(content(away))[2][:2] == ["forecast error on held-out data", "diverges"]
+    assert to_dict(content(away))["error"]["forecast"]["before"] == "inf"
+    assert "<svg" in page_of(away)
 
 
 def test_a_long_record_makes_no_larger_figures() -> None:
-    from latticebench.bench.report import page as drawn
-
     sizes = []
-    for rows in (2_000, 100_000):
-        t = np.linspace(0, 100, rows)
-        left = np.random.default_rng(1).normal(size=(rows, 1, 1))
-        wide = np.random.default_rng(1).normal(size=(rows, 1, 6))
-        omega, power, _ = report.spectrum(t, left[:, None])
-        pieces = [drawn._traces(t, left, 3.0, drawn.BEFORE), drawn._map(t, wide, 3.0)]
-        pieces.append(drawn._spectrum([(drawn.BEFORE, omega, power)], []))
+    for count in (2_000, 100_000):
+        t = np.linspace(0, 100, count)
+        left = np.random.default_rng(1).normal(size=(count, 1, 1))
+        wide = np.random.default_rng(1).normal(size=(count, 1, 6))
+        omega, power, _ = spectrum(t, left[:, None])
+        pieces = [pictures.traces(t, left, 3.0, pictures.BEFORE), pictures.site_map(t, wide, 3.0)]
+        pieces.append(pictures.spectrum([(pictures.BEFORE, omega, power)], []))
         sizes.append([len(piece) for piece in pieces])
     for short, long in zip(*sizes, strict=True):
         assert long < 1.5 * short + 2000
 
 
 def test_a_peak_of_a_long_record_is_not_thinned_away() -> None:
-    from latticebench.bench.report.page import _thinned
-
     t = np.linspace(0, 1, 50_000)
     values = np.zeros(50_000)
     values[31_234] = 7.0
-    x, y = _thinned(t, values)
+    x, y = pictures.thinned(t, values)
     assert len(x) < 3_000
     assert np.max(y) == 7.0
     assert np.all(np.diff(x) > 0)
 
 
-def test_pages_of_one_diagnosis_are_the_same(damped: Diagnosis) -> None:
-    assert page(damped, {"seed": 1}) == page(damped, {"seed": 1})
+def test_pages_of_one_diagnosis_are_the_same(damped: Diagnosis, about: Provenance) -> None:
+    assert page_of(damped, about) == page_of(damped, about)
 
 
 def test_a_page_is_written_whole_or_not_at_all(damped: Diagnosis, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
-        write_page(damped, {}, tmp_path / "file" / "page.html")
-    write_page(damped, {}, tmp_path / "new" / "page.html")
+        write_page(content(damped), curves(damped), None, tmp_path / "file" / "page.html")
+    write_page(content(damped), curves(damped), None, tmp_path / "new" / "page.html")
     assert (tmp_path / "new" / "page.html").read_text().endswith("</html>\n")
 
 
 def test_a_reading_far_beyond_all_others_is_pointed_at():
     t = np.linspace(0, 4, 30)
     u = np.stack([np.cos(t), np.sin(3 * t)], axis=1)
-    assert report.strays(Samples(t, u, source="swing.csv")) == []
+    assert strays(Samples(t, u, source="swing.csv")) == []
     u[7, 1] = 1e6
     v = np.zeros_like(u)
-    (text,) = report.strays(Samples(t, u, v, source="swing.csv"))
+    (text,) = strays(Samples(t, u, v, source="swing.csv"))
     assert text.startswith(f"swing.csv: u2 at t = {t[7]:g} is 1e+06")
     assert "empty" in text

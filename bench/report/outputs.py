@@ -1,0 +1,187 @@
+"""The JSON documents of the commands: a fit, a bound, a run, a comparison, a list; that of a diagnosis is in `content`."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field, JsonValue
+
+from latticebench.bench.report.document import Content, Document, Number, Provenance
+
+if TYPE_CHECKING:
+    from latticebench.bench.limit import Design, Limit
+    from latticebench.methods.method import Fit
+
+
+class FitDocument(Document):
+    """A fit, see `latticebench fit`.
+
+    Attributes:
+        coefficients: by term, in the units of the derivative over those of the term.
+        stderr: standard errors by term; None where the method gives none.
+        residual: RMS of what the equation leaves of the derivative over the RMS of the derivative.
+        seconds: wall time of the fit alone.
+        status: "ok", or what to know about the fit.
+    """
+
+    schema_: Literal["latticebench/fit/1"] = Field(
+        default="latticebench/fit/1", validation_alias="schema", serialization_alias="schema"
+    )
+    method: str
+    order: int
+    coefficients: dict[str, Number]
+    stderr: dict[str, Number] | None
+    residual: Number
+    seconds: Number
+    status: str
+
+
+class TermLimit(Content):
+    """How well a coefficient can be known: smallest standard error, the same relative, and what follows from it."""
+
+    coefficient: Number
+    stderr: Number
+    error: Number
+    verdict: str
+
+
+class Needed(Content):
+    """What a wanted relative error of the coefficients needs; see `bench.limit.Design`."""
+
+    target: Number
+    relative: Number
+    noise: Number
+    samples: int | None
+    span: Number | None
+    records: int
+
+
+class LimitDocument(Document):
+    """The Cramer-Rao bound, see `latticebench limit`.
+
+    Attributes:
+        about: where the bound was taken.
+        noise: the noise level, sigma over the RMS of the field about its mean.
+        samples, span: how many samples in all trajectories, and how long the longest lasts.
+        conditioning: of the terms' values, columns scaled to 1.
+        relative: the smallest root-mean-square of E2.
+        terms: by term.
+        groups: terms that are hard to tell apart.
+        needed: what a smaller error needs.
+    """
+
+    schema_: Literal["latticebench/limit/1"] = Field(
+        default="latticebench/limit/1", validation_alias="schema", serialization_alias="schema"
+    )
+    about: str
+    noise: Number
+    samples: int
+    span: Number
+    conditioning: Number
+    relative: Number
+    terms: dict[str, TermLimit]
+    groups: list[list[str]]
+    needed: Needed
+
+
+class CaseRow(Content):
+    """A row of the table of cases; scores of a case that gave none are null."""
+
+    part: str
+    data: str
+    library: str
+    method: str
+    noise: Number
+    seed: int
+    status: str
+    e2: Number
+    einf: Number
+    spurious: Number
+    tpr: Number
+    bound: Number
+    forecast_error: Number
+    forecast_horizon: Number
+    residual: Number
+    conditioning: Number
+    seconds: Number
+    cpu_seconds: Number
+    peak_mib: Number
+    covered: Number
+    reason: str
+    settings: str
+    identity: str
+
+
+class RunDocument(Document):
+    """The results of a run, see `latticebench run` and `latticebench table`."""
+
+    schema_: Literal["latticebench/run/1"] = Field(
+        default="latticebench/run/1", validation_alias="schema", serialization_alias="schema"
+    )
+    cases: list[CaseRow]
+
+
+class ComparedCase(Content):
+    """A case that got worse or better: its error or status in both runs, and the ratio of the errors."""
+
+    case: str
+    old: str
+    new: str
+    ratio: Number
+
+
+class CompareDocument(Document):
+    """One run judged by another, see `latticebench compare`.
+
+    Attributes:
+        worse, better: cases whose error grew or fell by more than a factor.
+        same: how many did neither.
+        gone, new: cases that only one of the runs has.
+    """
+
+    schema_: Literal["latticebench/compare/1"] = Field(
+        default="latticebench/compare/1", validation_alias="schema", serialization_alias="schema"
+    )
+    worse: list[ComparedCase]
+    better: list[ComparedCase]
+    same: int
+    gone: list[str]
+    new: list[str]
+
+
+class ListDocument(Document):
+    """What there is of a kind, see `latticebench list` and `latticebench data`."""
+
+    schema_: Literal["latticebench/list/1"] = Field(
+        default="latticebench/list/1", validation_alias="schema", serialization_alias="schema"
+    )
+    kind: Literal["systems", "libraries", "methods", "suites", "effects", "recordings"]
+    rows: list[dict[str, JsonValue]]
+
+
+def fit_document(found: Fit, about: Provenance) -> FitDocument:
+    """Return the document of a fit."""
+    texts = found.library.texts
+    return FitDocument(
+        provenance=about, method=found.method, order=found.order,
+        coefficients=dict(zip(texts, map(float, found.coefficients), strict=True)),
+        stderr=None if found.stderr is None else dict(zip(texts, map(float, found.stderr), strict=True)),
+        residual=found.residual, seconds=found.seconds, status=found.status,
+    )  # fmt: skip
+
+
+def limit_document(found: Limit, needed: Design, note: str, about: Provenance) -> LimitDocument:
+    """Return the document of a bound; `note` says where it was taken."""
+    texts = found.library.texts
+    rows = zip(texts, found.coefficients, found.stderr, found.errors, found.verdicts, strict=True)
+    return LimitDocument(
+        provenance=about, about=note, noise=found.noise, samples=found.samples, span=found.span,
+        conditioning=found.conditioning, relative=found.relative,
+        terms={
+            text: TermLimit(coefficient=value, stderr=stderr, error=error, verdict=verdict)
+            for text, value, stderr, error, verdict in rows
+        },
+        groups=[[texts[k] for k in group] for group in found.groups],
+        needed=Needed(**dataclasses.asdict(needed)),
+    )  # fmt: skip
