@@ -21,7 +21,7 @@ MEANINGS = {"e2": "relative error of the coefficients, median over seeds"}
 
 
 def console() -> Console:
-    """Make the console that results are printed on."""
+    """Return the console that results are printed on."""
     from rich.console import Console
 
     # A pipe has no width: let nothing be cut off there.
@@ -29,7 +29,7 @@ def console() -> Console:
 
 
 def show_rows(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a table; lists and tables within a cell are written out."""
+    """Print a table; lists and dictionaries within a cell are written out."""
     from rich import box
     from rich.markup import escape
     from rich.table import Table
@@ -68,7 +68,7 @@ def show_fit(fit: Fit) -> None:
 
 
 def show_limit(limit: Limit, design: Design, note: str) -> None:
-    """Print a bound: every coefficient with its smallest error and a verdict, and what more accuracy would need."""
+    """Print a bound: each coefficient with its smallest error and a verdict, and what more accuracy would need."""
     columns = ["term", "coefficient", "smallest error", "verdict"]
     rows = zip(limit.library.texts, limit.coefficients, limit.stderr, limit.verdicts, strict=True)
     show_rows(columns, [[text, f"{value:.6g}", f"{error:.2g}", verdict] for text, value, error, verdict in rows])
@@ -77,7 +77,8 @@ def show_limit(limit: Limit, design: Design, note: str) -> None:
         listed = "; ".join(limit.library.texts[k] for k in group)
         console().print(f"Hard to tell apart: {listed}", highlight=False, markup=False, soft_wrap=True)
     state = (
-        f"{note}\n{limit.samples} samples, noise level {limit.noise:.3g}; the terms' conditioning is {limit.conditioning:.2g}\n"
+        f"{note}\n{limit.samples} samples, noise level {limit.noise:.3g}; the terms' conditioning is "
+        f"{limit.conditioning:.2g}\n"
         f"All coefficients together can be known to {100 * limit.relative:.2g} % (root-mean-square of E2)."
     )
     if design.relative <= design.target:
@@ -87,7 +88,7 @@ def show_limit(limit: Limit, design: Design, note: str) -> None:
         if design.samples is not None:
             options.append(f"{design.samples} samples in the same time")
         if design.span is not None:
-            options.append(f"a record of length {design.span:.3g} with as many samples a time")
+            options.append(f"a record of length {design.span:.3g} with as many samples per time")
         options.append(f"{design.records} records like this one")
         text = f"{wanted} would need {', or '.join(options)}."
     for line in (state, text):
@@ -115,7 +116,7 @@ def show_results(results: Iterable[Mapping[str, Any]], about: Mapping[str, Any],
 
 @contextmanager
 def waiting(text: str) -> Iterator[None]:
-    """Show that something is going on, on a terminal."""
+    """Show what is being waited for, on a terminal."""
     if not sys.stderr.isatty():
         yield
         return
@@ -151,7 +152,7 @@ class Bar:
         self.running: list[str] = []
 
     def count(self, left: int) -> None:
-        """Learn how many cases are to be run."""
+        """Set how many cases are left to be run."""
         self.progress.update(self.task, total=self.total, completed=self.total - left)
 
     def started(self, case: Case) -> None:
@@ -160,9 +161,9 @@ class Bar:
         self._name_running()
 
     def finished(self, case: Case, result: dict[str, Any]) -> None:
-        """Count a case, and say what went wrong with it."""
+        """Count a case, and print what went wrong with it."""
         self.running = [title for title in self.running if title != case.title]
-        # Without a terminal there is no bar, and silence would look like a standstill.
+        # Without a terminal there is no bar; silence would look like a standstill.
         if result["status"] not in ("ok", "skipped") or not self.progress.console.is_terminal:
             reason = f": {result['reason']}" if result["reason"] else ""
             line = f"{result['status']}: {case.title}{reason}"
@@ -176,7 +177,7 @@ class Bar:
 
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[], None]]:
-    """Show on standard error how many of so many pieces of work are done; the function says that one more is."""
+    """Show on standard error how many of `total` pieces of work are done; calling the function counts one more."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 

@@ -68,7 +68,7 @@ def diagnose(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated noise that evidence is judged by.")] = 1,
 ) -> None:
-    """Find what a declared equation lacks: trace its residual to an effect, add that, and show the error before and after."""
+    """Find what a declared equation lacks: trace its residual to an effect, add it, show the error before and after."""
     from latticebench import methods
     from latticebench.bench.screen import watching
     from latticebench.diagnosis.repair import diagnose as close_the_loop
@@ -107,8 +107,8 @@ def _declared(system: str | None, terms: str | None, order: int | None) -> tuple
 
         if EQUATION not in [one.name for one in systems.find(system).libraries]:
             raise InputError(
-                f"--system {system}: it has no library {EQUATION!r} that says which coefficients are free; give it one, "
-                "or give --terms"
+                f"--system {system}: it has no library {EQUATION!r} that says which coefficients are free; give it "
+                "one, or give --terms"
             )
     return asked(system, EQUATION if terms is None else None, terms, order)
 

@@ -111,8 +111,8 @@ class Report(Content):
 
     Attributes:
         sentence: the verdict in one sentence.
-        declared, declared_stderr: coefficients of the declared terms in the last model, with standard errors; `_before` in
-            the declared equation alone.
+        declared, declared_stderr: coefficients of the declared terms in the last model, with standard errors.
+        declared_before, declared_stderr_before: the same in the declared equation alone.
         declared_truth: their true values, or None.
         noise: standard deviation of the noise on u, of a complex field in total.
         effects: what was added.
@@ -156,7 +156,8 @@ def content(diagnosis: Diagnosis) -> Report:
     after, after_errors = declared(course.after)
     found = added(diagnosis)
     return Report(
-        verdict=cast(Verdict, course.verdict), sentence=_sentence(course.verdict, found), recording=_recording(diagnosis),
+        verdict=cast(Verdict, course.verdict), sentence=_sentence(course.verdict, found),
+        recording=_recording(diagnosis),
         declared=after, declared_before=before, declared_stderr=after_errors, declared_stderr_before=before_errors,
         declared_truth=None if diagnosis.truth is None else dict(zip(after, map(float, diagnosis.truth), strict=True)),
         noise=diagnosis.noise[0] * course.after.records[0].value.shape[2] ** 0.5,

@@ -1,24 +1,17 @@
-"""Sums of terms as text in the term language, as LaTeX, and as MathML for browsers.
-
-SymPy's printers write LaTeX and MathML. They are taught the notation of a lattice: u with the index n+k, its time
-derivatives with dots, and sums over r >= 2.
-"""
+"""Sums of terms as text in the term language, as LaTeX, and as MathML for browsers."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from latticebench.methods.method import Fit
 
 if TYPE_CHECKING:
     import sympy
 
-# A field with its dots and its index, such as \ddot{u}_{n} or u_{n+1}.
-FIELD = re.compile(r"(?:\\(d?dot)\{)?([a-z]+)\}?_\{n(?:([+-])(\w+))?\}")
-DOTS = {"dot": "˙", "ddot": "¨"}
 DIGITS = 4
 
 
@@ -74,15 +67,16 @@ def expression(text: str) -> sympy.Expr:
 
 def latex(body: sympy.Expr) -> str:
     """Return an expression in LaTeX, without dollar signs."""
-    return _latex_printer().doprint(body)  # type: ignore[no-any-return]
+    from latticebench.bench.report.printers import LatticeLatex
+
+    return LatticeLatex().doprint(body)  # type: ignore[no-any-return]
 
 
 def mathml(body: sympy.Expr) -> str:
     """Return an expression in presentation MathML, without the outermost element `math`."""
-    found: str = _mathml_printer()._print(body).toxml()
-    for hyphen in ("<mo>-", "<mn>-"):
-        found = found.replace(hyphen, hyphen[:-1] + "−")
-    return found
+    from latticebench.bench.report.printers import LatticeMathML
+
+    return LatticeMathML().doprint(body)
 
 
 def latex_summand(value: float, body: sympy.Expr, *, first: bool = False) -> str:
@@ -114,70 +108,3 @@ def _rounded(value: float) -> sympy.Expr:
 
     text = f"{abs(value):.{DIGITS}g}"
     return sympy.Integer(text) if text.isdigit() else sympy.Float(text, DIGITS)
-
-
-@cache
-def _latex_printer() -> Any:
-    from sympy.printing.latex import LatexPrinter
-
-    class Printer(LatexPrinter):  # type: ignore[misc]
-        def _print_Sum(self, total: Any) -> str:
-            ((index, low, _),) = total.limits
-            return rf"\sum_{{{index} \ge {low}}} {self._print(total.function)}"
-
-    return Printer()
-
-
-@cache
-def _mathml_printer() -> Any:
-    """Return SymPy's printer with the notation of a lattice, and without elements that browsers lack."""
-    from sympy import Symbol
-    from sympy.printing.mathml import MathMLPresentationPrinter
-
-    class Printer(MathMLPresentationPrinter):  # type: ignore[misc]
-        def _element(self, tag: str, *inner: Any) -> Any:
-            made = self.dom.createElement(tag)
-            for one in inner:
-                made.appendChild(self.dom.createTextNode(one) if isinstance(one, str) else one)
-            return made
-
-        def _print_Symbol(self, symbol: Any, style: str = "plain") -> Any:
-            found = FIELD.fullmatch(symbol.name)
-            if not found:
-                return super()._print_Symbol(symbol, style)
-            dots, letter, sign, distance = found.groups()
-            name = self._element("mi", letter)
-            if dots:
-                name = self._element("mover", name, self._element("mo", DOTS[dots]))
-                name.setAttribute("accent", "true")
-            index = [self._element("mi", "n")]
-            if sign:
-                index += [
-                    self._element("mo", sign),
-                    self._element("mn" if distance.isdigit() else "mi", distance),
-                ]
-            return self._element("msub", name, self._element("mrow", *index))
-
-        def _print_AppliedUndef(self, called: Any) -> Any:
-            name = self._print(Symbol(called.func.__name__))
-            return self._element("mrow", name, self._paren_comma_separated(*called.args))
-
-        def _print_Sum(self, total: Any) -> Any:
-            ((index, low, _),) = total.limits
-            under = self._element("mrow", self._print(index), self._element("mo", "≥"), self._print(low))
-            sign = self._element("munder", self._element("mo", "∑"), under)
-            return self._element("mrow", sign, self._print(total.function))
-
-        def _print_conjugate(self, of: Any) -> Any:
-            return self._element("msup", self._element("mrow", self._print(of.args[0])), self._element("mo", "*"))
-
-        def _print_UnevaluatedExpr(self, of: Any) -> Any:
-            return self._print(of.args[0])
-
-        def _print_ImaginaryUnit(self, _: Any) -> Any:
-            return self._element("mi", "i")
-
-        def _print_Exp1(self, _: Any) -> Any:
-            return self._element("mi", "e")
-
-    return Printer()

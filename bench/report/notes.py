@@ -34,7 +34,8 @@ def strays(samples: Samples) -> list[str]:
             if np.max(away) > STRAY * others[-1] > 0:
                 found.append(
                     f"{samples.source}: {letter}{site + 1} at t = {samples.t[row]:g} is {column[row]:.4g}, more than "
-                    f"{STRAY:g} times as far out as any other reading of that site. If it is a slip, leave the cell empty."
+                    f"{STRAY:g} times as far out as any other reading of that site. If it is a slip, leave the cell "
+                    "empty."
                 )
     return found
 
@@ -102,12 +103,16 @@ def _of_the_names(diagnosis: Diagnosis) -> Iterator[str]:
         listed = ", ".join(one.name + place for one, place in zip(unnamed[:3], places, strict=False))
         yield f"What would do most for what is left, though it is no effect of the catalogue: {listed}."
     for name in course.repeated:
-        yield f"{name} was added more than once: a few of them can stand for any course in time, so that the name is in doubt."
+        yield (
+            f"{name} was added more than once: a few of them can stand for any course in time, so that the name is in "
+            "doubt."
+        )
     if course.rival is not None:
         name, lead = course.rival
         yield (
             f"{name} does {'better' if lead > EQUAL else 'as well'} in the place of the last effect (by {lead:.1f}, "
-            "natural logarithms of the likelihood ratio), though it is no effect of the catalogue: the name is in doubt."
+            "natural logarithms of the likelihood ratio), though it is no effect of the catalogue: the name is in "
+            "doubt."
         )
     if any(change.effect.acts == "clock" for change in course.after.model.changes):
         yield "How late a row to come will be read cannot be known: the forecast is for the times as they are told."

@@ -1,4 +1,4 @@
-"""The JSON documents of the commands: a fit, a bound, a run, a comparison, a list; that of a diagnosis is in `content`."""
+"""The JSON documents of a fit, a bound, a run, a comparison and a list; that of a diagnosis is in `content`."""
 
 from __future__ import annotations
 

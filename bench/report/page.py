@@ -1,6 +1,6 @@
 """A diagnosis as one HTML file: pictures as SVG, equations as MathML, no scripts, nothing loaded from elsewhere.
 
-The template escapes every text. What is put in as markup is made by SymPy's and matplotlib's printers and by the style sheet.
+The template escapes every text. Markup is only what SymPy and matplotlib write, and the style sheet.
 """
 
 from __future__ import annotations

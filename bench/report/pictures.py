@@ -1,6 +1,6 @@
 """The pictures of a diagnosis, drawn with matplotlib as SVG.
 
-They are drawn in stand-in colours that the style sheet of the page then sets, so that they follow a light or a dark screen.
+They are drawn in stand-in colours that the style sheet of the page sets, so that they follow a light or a dark screen.
 """
 
 from __future__ import annotations

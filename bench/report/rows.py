@@ -68,7 +68,7 @@ def errors(report: Report) -> list[list[str]]:
 
 
 def top(turn: Turn) -> list[Ranked]:
-    """Return the entries of a ranking that people are shown: the best few, and the best with a name if it is not one of them."""
+    """Return the entries of a ranking that people are shown: the best few, with at least one that has a name."""
     best = list(turn.ranking[:SHOWN])
     if not any(entry.named for entry in best):
         best += [entry for entry in turn.ranking if entry.named][:2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from latticebench.systems.readers import read
 from latticebench.systems.samples import Samples
 from latticebench.systems.writers import write
 
+Typed = Callable[..., tuple[int, str, str]]
 SYSTEM = """
 name = "mine"
 equation = "u[n+1]-u[n]"
@@ -55,7 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def typed(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+def typed(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Typed:
     """Type a command in the folder and give exit code, standard output and standard error."""
 
     def run(*arguments: str) -> tuple[int, str, str]:
@@ -69,7 +71,7 @@ def typed(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     return run
 
 
-def test_a_diagnosis_names_the_effect_and_writes_json_and_a_page(typed, folder: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_diagnosis_names_the_effect_and_writes_json_and_a_page(typed: Typed, folder: Path) -> None:
     code, out, err = typed(
         "diagnose",
         "damped.csv",
@@ -95,7 +97,7 @@ def test_a_diagnosis_names_the_effect_and_writes_json_and_a_page(typed, folder: 
     assert "latticebench diagnose" in page
 
 
-def test_json_to_the_screen_is_nothing_but_json_and_depends_on_the_seed_alone(typed) -> None:  # type: ignore[no-untyped-def]
+def test_json_to_the_screen_is_nothing_but_json_and_depends_on_the_seed_alone(typed: Typed) -> None:
     terms = "u[n+1]+u[n-1]-2*u[n]; u[n]; u[n]**3"
     first, second = (
         typed(
@@ -107,7 +109,7 @@ def test_json_to_the_screen_is_nothing_but_json_and_depends_on_the_seed_alone(ty
     assert json.loads(first[1])["verdict"] == "explained"
 
 
-def test_ends_that_are_not_told_are_unknown_with_terms_and_the_systems_own_with_a_system(typed) -> None:  # type: ignore[no-untyped-def]
+def test_ends_that_are_not_told_are_unknown_with_terms_and_the_systems_own_with_a_system(typed: Typed) -> None:
     terms = "u[n+1]+u[n-1]-2*u[n]; u[n]; u[n]**3"
     _, out, _ = typed("diagnose", "damped.csv", "--terms", terms, "--order", "2", "--json", "-")
     assert any("ends were not declared" in note for note in json.loads(out)["notes"])
@@ -115,7 +117,7 @@ def test_ends_that_are_not_told_are_unknown_with_terms_and_the_systems_own_with_
     assert not any("ends were not declared" in note for note in json.loads(out)["notes"])
 
 
-def test_forecasts_are_judged_on_the_file_that_is_held_out(typed) -> None:  # type: ignore[no-untyped-def]
+def test_forecasts_are_judged_on_the_file_that_is_held_out(typed: Typed) -> None:
     _, own, _ = typed("diagnose", "damped.csv", "--system", "phi4", "--json", "-")
     code, held, err = typed("diagnose", "damped.csv", "--system", "phi4", "--holdout", "later.csv", "--json", "-")
     assert (code, err) == (0, "")
@@ -148,7 +150,7 @@ def test_forecasts_are_judged_on_the_file_that_is_held_out(typed) -> None:  # ty
         (["damped.csv", "--system", "phi4", "--method", "guess"], "unknown method"),
     ],
 )
-def test_bad_input_is_one_line_that_says_where(typed, arguments: list[str], words: str) -> None:  # type: ignore[no-untyped-def]
+def test_bad_input_is_one_line_that_says_where(typed: Typed, arguments: list[str], words: str) -> None:
     code, out, err = typed("diagnose", *arguments)
     assert code == 2
     assert out == ""
@@ -157,13 +159,13 @@ def test_bad_input_is_one_line_that_says_where(typed, arguments: list[str], word
     assert words in err
 
 
-def test_too_few_rows_are_refused_in_one_line_or_diagnosed(typed) -> None:  # type: ignore[no-untyped-def]
+def test_too_few_rows_are_refused_in_one_line_or_diagnosed(typed: Typed) -> None:
     code, _, err = typed("diagnose", "two-rows.csv", "--system", "phi4")
     assert code in (0, 2)
     assert code == 0 or (err.startswith("error: two-rows.csv: ") and err.count("\n") == 1)
 
 
-def test_a_result_that_cannot_be_written_leaves_what_was_there(typed, folder: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_result_that_cannot_be_written_leaves_what_was_there(typed: Typed, folder: Path) -> None:
     (folder / "taken").write_text("mine")
     code, _, err = typed("diagnose", "damped.csv", "--system", "phi4", "--html", "taken/page.html")
     assert code == 2
@@ -171,7 +173,7 @@ def test_a_result_that_cannot_be_written_leaves_what_was_there(typed, folder: Pa
     assert (folder / "taken").read_text() == "mine"
 
 
-def test_a_file_name_of_any_kind_does_no_harm(typed, folder: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_file_name_of_any_kind_does_no_harm(typed: Typed, folder: Path) -> None:
     name = "<img src=x onerror=alert(1)>[bold]$&.csv"
     write(read(folder / "damped.csv"), folder / name)
     code, _, err = typed("diagnose", name, "--system", "phi4", "--html", "named.html")
@@ -186,7 +188,8 @@ def test_help_loads_nothing_heavy() -> None:
         "import sys; sys.argv = ['latticebench', *{command!r}]\n"
         "from latticebench.bench.cli import main\n"
         "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
-        "heavy = {{'torch', 'pysindy', 'sympy', 'pandas', 'scipy', 'matplotlib', 'sklearn', 'jinja2'}} & set(sys.modules)\n"
+        "known = {{'torch', 'pysindy', 'sympy', 'pandas', 'scipy', 'matplotlib', 'sklearn', 'jinja2'}}\n"
+        "heavy = known & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     for command in (["diagnose", "--help"], ["data"], ["data", "--json"], ["data", "take", "--help"]):

@@ -206,7 +206,7 @@ def test_the_terminal_shows_equation_ranking_errors_and_what_would_separate(
         assert words in out
 
 
-# The page -------------------------------------------------------------------------------------------------------------------------
+# The page -------------------------------------------------------------------------------------------------------------
 
 EVIL = '<img src=x onerror="document.title=\'owned\'"><script>document.title="owned"</script>$\\frac{&.csv'
 
@@ -237,13 +237,17 @@ def browsed(path: Path, *, extra: tuple[str, ...] = ()) -> str:
 
 MEASURE = """<script>addEventListener('load', () => {
   const box = (one) => { const b = one.getBoundingClientRect(); return [b.width, b.height]; };
+  const every = (selector) => [...document.querySelectorAll(selector)];
+  const handled = (one) => [...one.attributes].some((a) => a.name.startsWith('on'));
   const found = {
-    figures: [...document.querySelectorAll('figure svg')].map(box), math: [...document.querySelectorAll('math')].map(box),
-    images: [...document.querySelectorAll('svg image, img')].map(box), text: document.body.innerText, title: document.title,
-    scripts: document.scripts.length, wide: document.documentElement.scrollWidth, window: innerWidth,
-    handlers: [...document.querySelectorAll('*')].filter(e => [...e.attributes].some(a => a.name.startsWith('on'))).length,
+    figures: every('figure svg').map(box), math: every('math').map(box), images: every('svg image, img').map(box),
+    text: document.body.innerText, title: document.title, scripts: document.scripts.length,
+    wide: document.documentElement.scrollWidth, window: innerWidth, handlers: every('*').filter(handled).length,
   };
-  const out = document.createElement('pre'); out.id = 'measured'; out.textContent = JSON.stringify(found); document.body.append(out);
+  const out = document.createElement('pre');
+  out.id = 'measured';
+  out.textContent = JSON.stringify(found);
+  document.body.append(out);
 });</script>"""
 
 
@@ -287,7 +291,7 @@ def test_the_page_fits_a_phone(damped: Diagnosis, tmp_path: Path) -> None:
     outer = tmp_path / "outer.html"
     outer.write_text(
         f"<iframe id=f src='{inner.as_uri()}' style='width:360px;height:800px;border:0'></iframe>"
-        "<script>onload = () => { const d = f.contentDocument; document.title = d ? d.documentElement.scrollWidth : 'none' }</script>"
+        "<script>onload = () => { document.title = f.contentDocument?.documentElement.scrollWidth ?? 'none' }</script>"
     )
     document = browsed(outer, extra=("--allow-file-access-from-files", "--disable-web-security"))
     title = re.search(r"<title>(.*?)</title>", document)
