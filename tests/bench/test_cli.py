@@ -78,7 +78,8 @@ def test_a_fit_prints_its_equation_and_writes_json_in_the_order_of_the_terms(fol
     assert "u'' = " in out
     assert "u[n]**3" in out
     written = json.loads((folder / "fit.json").read_text())
-    assert list(written) == ["method", "order", "coefficients", "stderr", "residual", "seconds", "status"]
+    keys = ["method", "order", "coefficients", "stderr", "residual", "seconds", "status"]
+    assert list(written) == ["schema", "provenance", *keys]
     assert list(written["coefficients"]) == ["u[n+1]", "u[n-1]", "u[n]", "u[n]**3"]
     np.testing.assert_allclose(list(written["coefficients"].values()), [2, 2, -2, -2], rtol=0.02)
     assert (written["method"], written["order"], written["status"]) == ("stlsq", 2, "ok")
