@@ -110,7 +110,7 @@ class _Whitelist(ast.NodeVisitor):
             hint = "; write i*u[n] for the imaginary unit" if isinstance(node.value, complex) else ""
             raise self.refuse(node, f"{node.value!r} is not a real number{hint}")
         if not abs(node.value) <= MAX_NUMBER:
-            raise self.refuse(node, f"numbers end at {MAX_NUMBER:g}")
+            raise self.refuse(node, f"a number must not exceed {MAX_NUMBER:g} in size")
 
     def visit_Name(self, node: ast.Name) -> None:
         if node.id in CONSTANTS or node.id in self.names:
@@ -161,7 +161,7 @@ class _Whitelist(ast.NodeVisitor):
             if power is None:
                 raise self.refuse(node.right, "a power must be a number, as in u[n]**3")
             if not abs(power) <= MAX_POWER:
-                raise self.refuse(node.right, f"powers end at {MAX_POWER}")
+                raise self.refuse(node.right, f"a power must not exceed {MAX_POWER} in size")
         else:
             self.visit(node.right)
         if isinstance(node.op, (ast.Mult, ast.Pow)) and _monomial_count(node) > MAX_MONOMIALS:
@@ -170,7 +170,7 @@ class _Whitelist(ast.NodeVisitor):
             raise self.refuse(node, f"the total power is above {MAX_DEGREE}")
         value = _number(node)
         if value is not None and not abs(value) <= MAX_NUMBER:
-            raise self.refuse(node, f"numbers end at {MAX_NUMBER:g}")
+            raise self.refuse(node, f"a number must not exceed {MAX_NUMBER:g} in size")
 
 
 def site_offset(node: ast.expr) -> int | None:

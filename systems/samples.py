@@ -128,7 +128,7 @@ class Samples:
         At each site it is the cubic spline through the samples, after gaps have been bridged by straight lines.
 
         Raises:
-            InputError: no input was measured, or at one site none.
+            InputError: no input was measured, or all its values at a site are missing.
         """
         from scipy.interpolate import make_interp_spline
 
