@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,13 @@ import pytest
 from latticebench import systems
 from latticebench.bench.case import Folders
 from latticebench.bench.fitting import FitCase
-from latticebench.bench.limit import bound
+from latticebench.bench.limit import bound_of
 from latticebench.bench.run import Tally, run
 from latticebench.bench.store import FILE, Store, create, open_store
 from latticebench.bench.suite import Suite, load
 from latticebench.bench.worker import attempt
 from latticebench.systems.errors import InputError
-from latticebench.systems.simulate import sample_times
+from latticebench.systems.simulate import sample_times, simulate
 
 HERE = Path(__file__).parent
 posix = pytest.mark.skipif(os.name != "posix", reason="sends POSIX signals")
@@ -229,7 +230,8 @@ def test_a_noisy_case_holds_its_bound_and_one_without_noise_or_truth_none(tmp_pa
 
     found = attempt(case(known_ends=True), Folders(tmp_path))
     system = systems.find("phi4")
-    direct = bound(system, system.library("lib2"), sites=9, times=sample_times(20), noise=0.01)
+    clean = replace(simulate(system, sites=9, times=sample_times(20)), ends=system.ends)
+    direct = bound_of([clean], system.library("lib2"), system.order, noise=0.01)
     assert found["bound"] == pytest.approx(direct.relative, rel=1e-6)
     assert list(found["bounds"].values()) == pytest.approx(list(direct.stderr), rel=1e-6)
     assert tuple(found["verdicts"].values()) == direct.verdicts
