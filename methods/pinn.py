@@ -2,7 +2,7 @@
 
 A fully connected tanh network takes the time t and gives u_n(t) at every site, for order 2 also v_n(t), for a complex
 field real and imaginary parts. Its weights and the coefficients xi are trained together on the loss that
-`methods.engine.network_loss` writes out: the samples, du/dt = v, and the equation where the whole stencil was observed
+`methods.engine.networks.loss` writes out: the samples, du/dt = v, and the equation where the whole stencil was observed
 (the paper's interior sites) or, where the ends of the chain are known, at every site. Adam comes first, then L-BFGS.
 
 From the paper: the architecture, the outputs, both residuals, the mirrored data, Adam and L-BFGS as examples of
@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from latticebench.methods.engine.arrays import Arrays, host, one_thread
-from latticebench.methods.engine.descent import adam, lbfgs, lockstep
-from latticebench.methods.engine.history_log import HistoryLog
-from latticebench.methods.engine.members import best_member, member_draws, spread
-from latticebench.methods.engine.network_loss import JointLoss, LossSettings, NetworkLoss
-from latticebench.methods.engine.sizes import estimate_sizes
+from latticebench.methods.engine.networks.arrays import Arrays, host, one_thread
+from latticebench.methods.engine.networks.descent import adam, lbfgs, lockstep
+from latticebench.methods.engine.networks.history import HistoryLog
+from latticebench.methods.engine.networks.loss import JointLoss, LossSettings, NetworkLoss
+from latticebench.methods.engine.networks.members import best_member, member_draws, spread
+from latticebench.methods.engine.networks.sizes import estimate_sizes
 from latticebench.methods.method import Abilities, Fit, History
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from latticebench.methods.engine.arrays import Array
+    from latticebench.methods.engine.networks.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 One hidden layer of tanh units takes the time t and gives phi_k(t); the field is u_n(t) = sum_k a_kn phi_k(t). The
 velocity and the rate are its exact time derivatives, so that no residual of du/dt - v is needed. Output weights a and
 coefficients xi minimise the squares of the samples' residuals plus w^2 times those of the equation's residuals, each
-scaled by a size (`methods.engine.projection` has the formula). Differences from `pinn`:
+scaled by a size (`methods.engine.networks.projection` has the formula). Differences from `pinn`:
 
 - Variable projection: the problem is least squares in a and xi but for the library's nonlinearity, so
   Levenberg-Marquardt steps in both together end within a few iterations.
-- The hidden units are drawn and not trained (`methods.engine.hidden_units`). Their steepness follows from the
+- The hidden units are drawn and not trained (`methods.engine.networks.hidden_units`). Their steepness follows from the
   frequencies in the samples, they bend evenly over the span, and they are orthonormal, which keeps the least squares
   well conditioned.
 - The weight w follows from the samples: from weak to strong, the one with the least generalised cross-validation score
@@ -28,11 +28,11 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from latticebench.methods.engine.arrays import Arrays, host, one_thread
-from latticebench.methods.engine.history_log import HistoryLog
-from latticebench.methods.engine.members import best_member, member_draws, spread
-from latticebench.methods.engine.projection import Curve, CurveSettings, Step, project, step
-from latticebench.methods.engine.sizes import estimate_sizes
+from latticebench.methods.engine.networks.arrays import Arrays, host, one_thread
+from latticebench.methods.engine.networks.history import HistoryLog
+from latticebench.methods.engine.networks.members import best_member, member_draws, spread
+from latticebench.methods.engine.networks.projection import Curve, CurveSettings, Step, project, step
+from latticebench.methods.engine.networks.sizes import estimate_sizes
 from latticebench.methods.method import Abilities, Fit, History, Smooth
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from latticebench.methods.engine.arrays import Array
+    from latticebench.methods.engine.networks.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ import pandas as pd
 from latticebench import methods, systems
 from latticebench.bench.provenance import origin
 from latticebench.bench.publish import render
-from latticebench.methods.engine.sizes import estimate_sizes
+from latticebench.methods.engine.networks.sizes import estimate_sizes
 from latticebench.methods.method import make, solve
 from latticebench.methods.pinn import PINN
 from latticebench.systems.files import write_text

@@ -7,7 +7,7 @@ import pytest
 
 from latticebench import systems
 from latticebench.methods import pinn_vp
-from latticebench.methods.engine.members import member_draws
+from latticebench.methods.engine.networks.members import member_draws
 from latticebench.methods.method import Skipped, make, solve
 from latticebench.methods.pinn_vp import PINNVP
 from latticebench.systems.errors import InputError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.methods.engine.descent import lockstep
+from latticebench.methods.engine.networks.descent import lockstep
 
 
 @pytest.mark.parametrize("package", ["numpy", "torch"])

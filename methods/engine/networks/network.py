@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from latticebench.methods.engine.arrays import Array
+    from latticebench.methods.engine.networks.arrays import Array
 
 
 def layer_shapes(layers: int, width: int, outputs: int) -> list[tuple[int, int]]:

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.methods.engine.equation import Equation, columns, equation, multipliers
-from latticebench.methods.engine.network import (
+from latticebench.methods.engine.networks.equation import Equation, columns, equation, multipliers
+from latticebench.methods.engine.networks.network import (
     backward,
     forward,
     initial_weights,
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from latticebench.methods.engine.arrays import Array, Arrays
-    from latticebench.methods.engine.sizes import Sizes
+    from latticebench.methods.engine.networks.arrays import Array, Arrays
+    from latticebench.methods.engine.networks.sizes import Sizes
 
 
 @dataclass(frozen=True)

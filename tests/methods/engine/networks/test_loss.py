@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.methods.engine.arrays import Arrays
-from latticebench.methods.engine.network import initial_weights
-from latticebench.methods.engine.network_loss import LossSettings, NetworkLoss
-from latticebench.methods.engine.sizes import estimate_sizes
+from latticebench.methods.engine.networks.arrays import Arrays
+from latticebench.methods.engine.networks.loss import LossSettings, NetworkLoss
+from latticebench.methods.engine.networks.network import initial_weights
+from latticebench.methods.engine.networks.sizes import estimate_sizes
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.samples import Samples
 

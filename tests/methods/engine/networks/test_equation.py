@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from latticebench.methods.engine.equation import columns
+from latticebench.methods.engine.networks.equation import columns
 from latticebench.systems.samples import Samples
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.methods.engine.members import best_member, member_draws, spread
+from latticebench.methods.engine.networks.members import best_member, member_draws, spread
 from latticebench.systems.lattice import library
 
 

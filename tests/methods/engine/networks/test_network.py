@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.methods.engine.network import forward, initial_weights, layer_shapes, split_layers, workspace
+from latticebench.methods.engine.networks.network import forward, initial_weights, layer_shapes, split_layers, workspace
 
 
 def test_the_tangent_is_the_derivative_that_torch_finds_by_forward_mode():

@@ -1,6 +1,6 @@
 """A network's output weights and an equation's coefficients solved for together by least squares.
 
-The hidden units are fixed (`methods.engine.hidden_units`), so that the fields are linear in the output weights a,
+The hidden units are fixed (`methods.engine.networks.hidden_units`), so that the fields are linear in the output weights a,
 
     u_n(t) = sum_k a_kn phi_k(t),   du_n/dt = sum_k a_kn dphi_k/dt,   and so on.
 
@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from latticebench.methods.engine.arrays import host
 from latticebench.methods.engine.derivatives import DEGREE, differentiate
-from latticebench.methods.engine.equation import columns, equation
-from latticebench.methods.engine.hidden_units import Basis, draw_basis, stack_bases
+from latticebench.methods.engine.networks.arrays import host
+from latticebench.methods.engine.networks.equation import columns, equation
+from latticebench.methods.engine.networks.hidden_units import Basis, draw_basis, stack_bases
 from latticebench.methods.method import Skipped, Smooth
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from latticebench.methods.engine.arrays import Array, Arrays
-    from latticebench.methods.engine.sizes import Sizes
+    from latticebench.methods.engine.networks.arrays import Array, Arrays
+    from latticebench.methods.engine.networks.sizes import Sizes
 
 # Dense normal equations of this size take 800 MB with their inverse.
 MAX_UNKNOWNS = 7000

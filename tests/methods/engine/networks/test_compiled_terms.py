@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from latticebench.methods.engine.compiled_terms import compile_terms, power
+from latticebench.methods.engine.networks.compiled_terms import compile_terms, power
 
 
 def test_terms_compiled_for_training_agree_with_plain_arithmetic():

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from latticebench.methods.engine.arrays import Array, Arrays
+    from latticebench.methods.engine.networks.arrays import Array, Arrays
 
 # Singular values below this share of the largest are round-off of nearly equal units.
 CUT = 1e-10

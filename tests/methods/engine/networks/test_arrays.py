@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.methods.engine.arrays import Arrays
+from latticebench.methods.engine.networks.arrays import Arrays
 
 
 @pytest.mark.parametrize("device", ["cpu", "cpu:0"])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.methods.engine.arrays import Arrays
-from latticebench.methods.engine.projection import Curve, CurveSettings, step
-from latticebench.methods.engine.sizes import estimate_sizes
+from latticebench.methods.engine.networks.arrays import Arrays
+from latticebench.methods.engine.networks.projection import Curve, CurveSettings, step
+from latticebench.methods.engine.networks.sizes import estimate_sizes
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.samples import Samples
 

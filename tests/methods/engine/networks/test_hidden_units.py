@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from latticebench.methods.engine.hidden_units import draw_basis
+from latticebench.methods.engine.networks.hidden_units import draw_basis
 
 
 def test_the_hidden_layer_is_orthonormal_and_its_derivatives_are_those_of_finite_differences():

@@ -15,7 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy import ndarray
 
-    from latticebench.methods.engine.arrays import Array
+    from latticebench.methods.engine.networks.arrays import Array
 
     # The loss and its gradient at a point.
     Evaluate = Callable[[Array], tuple[Any, Array]]

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from latticebench.methods.engine.compiled_terms import CompiledTerms, compile_terms
 from latticebench.methods.engine.inputs import inputs
+from latticebench.methods.engine.networks.compiled_terms import CompiledTerms, compile_terms
 from latticebench.systems.compiler import Slot
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from latticebench.methods.engine.arrays import Array, Arrays
+    from latticebench.methods.engine.networks.arrays import Array, Arrays
 
 
 @dataclass(frozen=True, eq=False)
