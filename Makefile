@@ -27,6 +27,7 @@ lint: $(READY)
 
 types: $(READY)
 	$(BIN)/mypy
+	$(BIN)/mypy results/*/*.py
 
 wheel: $(READY)
 	rm -rf dist build

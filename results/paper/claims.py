@@ -13,7 +13,7 @@ verdict on a remark follows from the figures by a rule in the function of that r
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from latticebench.bench.case import exact_regression, samples
+from latticebench.bench.fitting import FitCase, exact_regression, samples
 from latticebench.bench.publish import render
 from latticebench.bench.store import open_store
-from latticebench.bench.suite import Case, load
+from latticebench.bench.suite import load
 from latticebench.bench.tables import read_cases
 from latticebench.systems.files import write_text
 
@@ -55,14 +55,14 @@ class Judgement:
     table: pd.DataFrame
 
 
-def learning(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+def learning(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Return how many sites each initial state of phi^4 sets in motion, and how many steps `pinn` needed.
 
     The number of sites in motion is the participation number (sum e)^2 / sum e^2 with e_n the mean of v_n^2 over time.
     """
     found = []
     for result in results:
-        case = Case.model_validate(result["case"])
+        case = FitCase.model_validate(result["case"])
         if case.part not in IN_MOTION or case.label != "pinn" or result["history"] is None:
             continue
         clean = samples(case, Path())[0]
@@ -193,7 +193,7 @@ def sines(run: Tables) -> Judgement:
 
 def powers(run: Tables) -> pd.DataFrame:
     """Compare the fits of panel (5b), coefficient by coefficient, with least squares on the exact derivative."""
-    case = next(case for case in load("paper").cases if case.part == "5b")
+    case = next(case for case in load("paper").cases if isinstance(case, FitCase) and case.part == "5b")
     _, library = case.resolve(Path())
     exact = exact_regression(samples(case, Path()), library).least_squares()
     found = {"exact least squares": exact}
@@ -292,7 +292,7 @@ def page() -> str:
 def main() -> None:
     """Write learning.csv if a store is given on the command line, and claims.md."""
     if len(sys.argv) > 1:
-        results, expected = open_store(Path(sys.argv[1])).all(), len(load("paper").cases)
+        results, expected = open_store(Path(sys.argv[1])).results(history=True), len(load("paper").cases)
         if len(results) != expected:
             raise SystemExit(f"the store has {len(results)} of the suite's {expected} results; finish the run first")
         write_text(HERE / "learning.csv", learning(results).to_csv(index=False))
