@@ -1,21 +1,22 @@
-"""Whether anything at all is left: noise does not go on from sample to sample or from site to site, and has no reading far out.
+"""Whether anything at all is left: noise is not correlated in time or along the chain, and has no reading far out.
 
-The residual r, in units of the noise and free of what the model can do, stands on its lattice of times and sites. With G a bell of some
-width in samples and some in sites, q = r G r / r r is larger than for noise where neighbours in the residual agree: a portmanteau test (Box
-& Pierce, J. Amer. Statist. Assoc. 65, 1509 (1970)), which needs neither a form nor the noise's size. The null distribution of q is
-simulated as that of the effects is (`diagnosis.trace`); its tail is that of the gamma distribution with the same mean and variance (q, with the bell's own middle in it, is never negative).
+The residual r, in units of the noise and free of what the model can do, stands on its lattice of times and sites. With
+G a bell of some width in samples and some in sites, q = r G r / r r is larger than for noise where neighbours in the
+residual agree: a portmanteau test (Box & Pierce, J. Amer. Statist. Assoc. 65, 1509 (1970)), which needs neither a form
+nor the noise's size. The null distribution of q is simulated as that of the effects is (`diagnosis.trace`); its tail is
+that of the gamma distribution with the same mean and variance (q, with the bell's own middle in it, is never negative).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage, stats
 
-from latticebench.diagnosis.model import Change
-from latticebench.diagnosis.trace import CHUNK, Finding, surrogate_residuals
-from latticebench.systems.effects import Effect
+from latticebench.diagnosis.candidate import UNNAMED
+from latticebench.diagnosis.trace import CHUNK, Screened, surrogate_residuals
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -32,8 +33,8 @@ NAMES = {
 }
 
 
-def coherence(tangent: Tangent, draw: np.random.Generator, surrogates: int = 200) -> Finding:
-    """Give what noise alone would do least often; `Finding.rarity` says how rarely, over all widths."""
+def coherence(tangent: Tangent, draw: np.random.Generator, surrogates: int = 200) -> Screened:
+    """Return the agreement of neighbours that noise alone would show least often; its `rarity` counts all widths."""
     sites = tangent.paths[0].record.stretches.dynamics.sites
     widths = [(a, b) for a in IN_TIME for b in ALONG if (a or b) and (sites > 1 or not b)]
     own = _agreement(tangent, tangent.residual[:, None], widths)[:, 0]
@@ -50,25 +51,33 @@ def coherence(tangent: Tangent, draw: np.random.Generator, surrogates: int = 200
     name = NAMES[widths[best][0] > 0, widths[best][1] > 0]
     # Far out, where it matters, the widths are as good as independent, however alike they are near the middle.
     count = float(len(widths))
-    return Finding(name, Change(Effect("unnamed", "0")), gain, 1, count, float(np.log(count)), named=False)
+    return Screened(name, UNNAMED, gain, 1, count, float(np.log(count)), named=False)
 
 
-def farthest(tangent: Tangent) -> Finding:
-    """Give the reading that is farthest out, in units of what is left of all; `Finding.rarity` says how rarely Gaussian noise has such a one."""
+def farthest(tangent: Tangent) -> Screened:
+    """Return the reading that is farthest out, in units of what is left of all.
+
+    Its `rarity` says how rarely Gaussian noise has such a one.
+    """
     away = tangent.residual**2 * tangent.spare / np.sum(tangent.residual**2)
     sites = np.concatenate([np.nonzero(path.weight > 0)[-1] for path in tangent.paths])
     first = int(np.argmax(away))
     count = float(len(away))
-    return Finding(
-        "single readings far out", Change(Effect("unnamed", "0"), site=int(sites[first])), float(away[first]), 1, count, float(np.log(count)),
+    return Screened(
+        "single readings far out",
+        replace(UNNAMED, site=int(sites[first])),
+        float(away[first]),
+        1,
+        count,
+        float(np.log(count)),
         named=False,
-    )  # fmt: skip
+    )
 
 
 def _agreement(
     tangent: Tangent, residuals: Float[ndarray, "rows draws"], widths: list[tuple[float, float]]
 ) -> Float[ndarray, "widths draws"]:
-    """Give q for each width and draw."""
+    """Return q for each width and draw (widths, draws)."""
     total = np.zeros((len(widths), residuals.shape[1]))
     begin = 0
     for path in tangent.paths:

@@ -1,11 +1,13 @@
 """The residual of a fitted model, as two things, and the noise that it is measured against.
 
-- Of the forecast: what a motion that follows the equation exactly, from the best starting state, leaves of the readings.
-- Of the dynamics: what the equation leaves of the acceleration (order 2) or rate (order 1) along the state that the readings
-  themselves suggest, a smoothing spline.
+- Of the forecast: what a motion that follows the equation exactly, from the best starting state, leaves of the
+  readings.
+- Of the dynamics: what the equation leaves of the acceleration (order 2) or rate (order 1) along the state that the
+  readings themselves suggest, a smoothing spline.
 
-The noise is estimated from the readings alone, by a spline whose knots cross-validation chooses (`methods.weak`), and from what the
-last model leaves; the smaller of the two counts, since a spline that cannot follow the field takes some of it for noise.
+The noise is estimated from the readings alone, by a spline whose knots cross-validation chooses
+(`methods.engine.spline_state`), and from what the last model leaves; the smaller of the two counts, since a spline that
+cannot follow the field takes some of it for noise.
 """
 
 from __future__ import annotations
@@ -35,14 +37,14 @@ if TYPE_CHECKING:
 HELD_OUT = 0.3
 # Samples of a long record that the noise is estimated from at a time.
 GLANCE = 1000
-# Of a record in many pieces, so many are forecast.
+# Forecasts of a record in many pieces, at most.
 MOST_FORECASTS = 8
 FEWEST_ROWS = 4
 LONGEST_LAG = 200
 
 
-def noise(fitted: Fitted) -> Float[ndarray, " levels"]:
-    """Give the standard deviation of the noise on u and, where it was observed, on v; for a complex field of each part."""
+def noise_of_fit(fitted: Fitted) -> Float[ndarray, " levels"]:
+    """Return the standard deviation of the noise on u and, where observed, on v; per part of a complex field."""
     own = fitted.sigma * np.sqrt(dof_share(fitted))
     spline = noise_of_readings(fitted.data, fitted.model.order, len(own))
     return np.asarray(np.where(np.isfinite(spline), np.minimum(spline, own), own))
@@ -68,22 +70,23 @@ def noise_of_readings(data: Sequence[Samples], order: int, levels: int) -> Float
 
 
 def dof_share(fitted: Fitted) -> float:
-    """Give what the noise's variance must be multiplied by because the parameters of the changes were fitted, too."""
+    """Return the factor of the noise's variance that the fit of the effects' parameters makes necessary."""
     spare = fitted.count - fitted.solution.parameters
     return float(max(spare, 1) / max(fitted.count - fitted.parameters, 1))
 
 
-def over_noise(fitted: Fitted, noise: Float[ndarray, " levels"]) -> float:
-    """Give the residual of the forecast in units of the noise: 1 when nothing is left."""
+def residual_rms(fitted: Fitted, noise: Float[ndarray, " levels"]) -> float:
+    """Return the RMS of what a fit leaves of the readings, in units of the noise: 1 when nothing is missing."""
     counts = fitted.solution.counts
     ratio = (fitted.sigma**2 * dof_share(fitted)) / noise**2
     return float(np.sqrt(np.sum(counts * ratio) / np.sum(counts)))
 
 
 def correlation_time(fitted: Fitted) -> float:
-    """Give how many samples one independent number of the residual takes: 1 + 2 sum of its autocorrelation up to the first zero; at least 1.
+    """Return the number of samples per independent number of the residual, at least 1.
 
-    Noise alone gives 1. What a model that is far off leaves goes on from sample to sample, and tells less than its count of numbers.
+    This is 1 + 2 sum of its autocorrelation up to the first zero: 1 for white noise. What a model that is far off
+    leaves is correlated, and tells less than its count of numbers.
     """
     together: dict[int, float] = {}
     for left in fitted.residuals():
@@ -116,7 +119,7 @@ class DynamicsResidual:
 
 
 def of_dynamics(fitted: Fitted) -> list[DynamicsResidual]:
-    """Give the residual of the dynamics of each trajectory."""
+    """Return the residual of the dynamics of each trajectory."""
     found = []
     coefficients = fitted.solution.state.coefficients
     for record, samples in zip(fitted.records, fitted.data, strict=True):
@@ -128,8 +131,8 @@ def of_dynamics(fitted: Fitted) -> list[DynamicsResidual]:
         u = np.stack([one.value for one in parts], axis=1)
         v = np.stack([one.first for one in parts], axis=1)
         if record.value.shape[1] > 1:
-            again = [differentiate(samples.t, np.where(record.seen[:, 1, k], record.value[:, 1, k], np.nan), "smoothing-spline")
-                     for k in range(dynamics.parts)]  # fmt: skip
+            readings = np.where(record.seen[:, 1], record.value[:, 1], np.nan)
+            again = [differentiate(samples.t, readings[:, k], "smoothing-spline") for k in range(dynamics.parts)]
             v = np.stack([one.value for one in again], axis=1)
             rate = np.stack([one.first for one in again], axis=1)
         else:
@@ -146,7 +149,10 @@ def of_dynamics(fitted: Fitted) -> list[DynamicsResidual]:
 
 
 def dynamics_share(fitted: Fitted) -> float:
-    """Give the share of the derivative that the equation leaves (RMS over RMS, all trajectories together); NaN where they are too short to smooth."""
+    """Return the share of the derivative that the equation leaves: RMS over RMS, all trajectories together.
+
+    NaN where they are too short to smooth.
+    """
     try:
         every = of_dynamics(fitted)
     except InputError:
@@ -158,11 +164,11 @@ def dynamics_share(fitted: Fitted) -> float:
     return float(np.sqrt(left / rate)) if rate > 0 else float("nan")
 
 
-# The forecast of what was not fitted ----------------------------------------------------------------------------------------------
+# The forecast of what was not fitted ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class Forecast:
+class Prediction:
     """A motion predicted from a fitted state, beside what was observed.
 
     Attributes:
@@ -178,15 +184,16 @@ class Forecast:
     error: float
 
 
-def forecast(fitted: Fitted, held_out: Sequence[Samples] = ()) -> list[Forecast]:
-    """Predict what was not fitted.
+def predict(fitted: Fitted, held_out: Sequence[Samples] = ()) -> list[Prediction]:
+    """Return forecasts of what was not fitted.
 
-    Without other recordings the coefficients are fitted again to the first 70 % of each trajectory, its structure being that of
-    `fitted`, and the rest is predicted; a pulse that comes later cannot be foreseen and is left out. Other recordings give only their starting state: from their own first 30 %.
+    Without other recordings the coefficients are fitted again to the first 70 % of each trajectory, the model being
+    that of `fitted`, and the rest is predicted; a pulse that comes later cannot be foreseen and is left out. Of other
+    recordings only the initial state is fitted, to their first 30 %.
     """
     if held_out:
         # How a chain ends is known as well as for the recordings that were fitted.
-        return [_predict(fitted, samples, HELD_OUT, None) for samples in held_out if len(samples.t) >= FEWEST_ROWS]
+        return [_follow(fitted, samples, HELD_OUT, None) for samples in held_out if len(samples.t) >= FEWEST_ROWS]
     enough = [number for number, samples in enumerate(fitted.data) if len(samples.t) >= FEWEST_ROWS]
     chosen = (
         [enough[k] for k in np.unique(np.linspace(0, len(enough) - 1, MOST_FORECASTS).astype(int))] if enough else []
@@ -199,22 +206,22 @@ def forecast(fitted: Fitted, held_out: Sequence[Samples] = ()) -> list[Forecast]
     start = replace(state, nodes=tuple(nodes[:cut] for nodes, cut in zip(state.nodes, cuts, strict=True)))
     again = refit(fitted.model, early, start)
     return [
-        _predict(again, samples, cuts[number] / len(samples.t), number)
+        _follow(again, samples, cuts[number] / len(samples.t), number)
         for number, samples in zip(chosen, data, strict=True)
     ]
 
 
 def _foreseeable(fitted: Fitted, early: Sequence[Samples]) -> Fitted:
-    """Leave out pulses of which the early samples have not seen the middle: nothing is known of their strength."""
-    for number in reversed(range(len(fitted.model.changes))):
-        change = fitted.model.changes[number]
-        if change.effect.acts == "pulse" and not any(one.t[0] <= change.psi["at"] <= one.t[-1] for one in early):
+    """Return a fit without pulses whose middle the early samples do not show: nothing is known of their strength."""
+    for number in reversed(range(len(fitted.model.effects))):
+        placed = fitted.model.effects[number]
+        if placed.effect.acts == "pulse" and not any(one.t[0] <= placed.psi["at"] <= one.t[-1] for one in early):
             fitted = without(fitted, number)
     return fitted
 
 
-def pooled(forecasts: Sequence[Forecast]) -> float:
-    """Give the root mean square error of forecasts over that of the readings; infinite where one runs away."""
+def pooled(forecasts: Sequence[Prediction]) -> float:
+    """Return the root mean square error of forecasts over that of the readings; infinite where one runs away."""
     left, size = 0.0, 0.0
     for one in forecasts:
         with np.errstate(all="ignore"):
@@ -224,15 +231,15 @@ def pooled(forecasts: Sequence[Forecast]) -> float:
 
 
 def alike(fitted: Fitted, other: Fitted) -> Fitted:
-    """Give a fit to the same pieces as another, so that both can be compared."""
+    """Return a fit to the same pieces as another, so that both can be compared."""
     sizes = [len(samples.t) for samples in other.data]
     if [len(samples.t) for samples in fitted.data] == sizes:
         return fitted
     return refit(fitted.model, other.data, carried(fitted, other.data))
 
 
-def _predict(fitted: Fitted, samples: Samples, known: float, number: int | None) -> Forecast:
-    """Follow the motion from a state fitted to the first part of a record through the rest."""
+def _follow(fitted: Fitted, samples: Samples, known: float, number: int | None) -> Prediction:
+    """Return the forecast of the rest of a record, from a state fitted to its first part."""
     cut = max(2, round(len(samples.t) * known))
     model, sigma = fitted.model, fitted.sigma
     coefficients = fitted.solution.state.coefficients
@@ -246,7 +253,7 @@ def _predict(fitted: Fitted, samples: Samples, known: float, number: int | None)
     else:
         nodes = fitted.solution.state.nodes[number]
     past = _Past(samples, nodes, fitted)
-    model = replace(model, changes=tuple(replace(one, past=(past,)) if one.past else one for one in model.changes))
+    model = replace(model, effects=tuple(replace(one, past=(past,)) if one.past else one for one in model.effects))
     full = model.records([samples])[0]
     stretches, dynamics = full.stretches, full.stretches.dynamics
     # At unknown ends the border's own readings are the drive.
@@ -262,16 +269,16 @@ def _predict(fitted: Fitted, samples: Samples, known: float, number: int | None)
     driven = stretches.driven(late, splines) if stretches.drive is not None else None
     field = dynamics.whole(np.stack(states[1:]), driven)[:, :1]
     predicted = field.copy()
-    for change in model.changes:
+    for placed in model.effects:
         # Which way a clock errs in rows to come cannot be known.
-        if change.effect.acts in INSTRUMENT and change.effect.acts != "clock":
-            predicted += change.misreading(late, field, np.zeros_like(field))
+        if placed.effect.acts in INSTRUMENT and placed.effect.acts != "clock":
+            predicted += placed.misreading(late, field, np.zeros_like(field))
     seen = split_parts(samples.u[cut:], samples.is_complex)
     moving = seen[..., dynamics.moving]
     with np.errstate(all="ignore"):
         left = moving - predicted[:, 0][..., dynamics.moving]
         error = float(np.sqrt(np.nanmean(left**2) / max(float(np.nanmean(moving**2)), 1e-300)))
-    return Forecast(late, seen, predicted[:, 0], error if np.isfinite(error) else float("inf"))
+    return Prediction(late, seen, predicted[:, 0], error if np.isfinite(error) else float("inf"))
 
 
 class _Past:
@@ -297,4 +304,4 @@ class _Past:
 
 
 def _remembers(fitted: Fitted) -> bool:
-    return any(change.past for change in fitted.model.changes)
+    return any(placed.past for placed in fitted.model.effects)

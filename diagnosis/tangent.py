@@ -4,10 +4,10 @@ Along a fitted trajectory a small extra force s(t) on the equation moves the sta
 
     dz/dt = (dF/dy) z + B s(t),   z(0) = 0
 
-(B puts a force into the highest derivative). The flow's derivatives come from `systems.sensitivity`, on a grid that has an even
-number of steps between two samples; Simpson's rule takes the integral of the force. What the start of each trajectory, the drive at
-unknown ends and the coefficients already in the model can absorb is projected out: what is left of a column is what the data can
-say about it. All rows are in units of the noise.
+(B puts a force into the highest derivative). The flow's derivatives come from `methods.engine.sensitivity`, on a grid
+that has an even number of steps between two samples; Simpson's rule takes the integral of the force. What the start of
+each trajectory, the drive at unknown ends and the coefficients already in the model can absorb is projected out: what
+is left of a column is what the data can say about it. All rows are in units of the noise.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.model import ACCURACY, Fitted, Force, rates, read_term
+from latticebench.diagnosis.model import ACCURACY, Fitted, rates
+from latticebench.diagnosis.placed import Force, read_term
 from latticebench.methods.engine.record import Record
 from latticebench.methods.engine.sensitivity import Stretches, Transition
 from latticebench.methods.engine.shooting import tolerances
@@ -69,12 +70,12 @@ class Path:
         return self.record.stretches.dynamics.is_complex
 
     def fields(self) -> tuple[ndarray, ndarray | None]:
-        """Give u and v (None for order 1) on the fine grid, (F, N) each."""
+        """Return u and v (None for order 1) on the fine grid, (F, N) each."""
         whole = self.field[:, :, 0] + 1j * self.field[:, :, 1] if self.is_complex else self.field[:, :, 0]
         return whole[:, 0], (whole[:, 1] if whole.shape[1] > 1 else None)
 
     def sources(self, terms: Sequence[Term], ends: Ends | None = None) -> Float[ndarray, "terms fine parts sites"]:
-        """Evaluate terms along the path at the sites that have an equation; 0 where their stencil is not whole."""
+        """Return terms along the path at the sites that have an equation; 0 where their stencil is not whole."""
         dynamics = self.record.stretches.dynamics
         u, v = self.fields()
         ends = ends or dynamics.ends
@@ -86,9 +87,10 @@ class Path:
         return sites[..., dynamics.moving]
 
     def turning(self) -> Float[ndarray, "fine parts sites"]:
-        """Give the mean of sign(v) over what v may be: erf(v / (sqrt(2) s)), s the noise on v or, unseen, that on u over a step.
+        """Return the mean of sign(v) over what v may be: erf(v / (sqrt(2) s)).
 
-        Where a site turns round or is at rest, nobody knows which way friction acts.
+        The noise s on v is that of u over a step where v is not observed. Where a site turns round or is at rest, it is
+        unknown which way friction acts.
         """
         from scipy.special import erf
 
@@ -98,7 +100,7 @@ class Path:
         return np.asarray(erf(v / (np.sqrt(2) * spread)))
 
     def answer(self, source: Float[ndarray, "columns fine parts sites"]) -> Float[ndarray, "rows columns"]:
-        """Give what forces do to the readings, in units of the noise, one column each."""
+        """Return what forces do to the readings, in units of the noise, one column each."""
         dynamics = self.record.stretches.dynamics
         size = dynamics.size
         columns = len(source)
@@ -114,18 +116,18 @@ class Path:
         return self.readings(z[:: self.steps // 2])
 
     def readings(self, z: Float[ndarray, "time columns state"]) -> Float[ndarray, "rows columns"]:
-        """Pick what was seen of changes of the state, in units of the noise."""
+        """Return what was seen of shifts of the state, in units of the noise."""
         dynamics = self.record.stretches.dynamics
         whole = dynamics.whole(z, None)[:, :, : self.weight.shape[1]]
         return self.rows(np.moveaxis(whole, 1, 0))
 
     def rows(self, columns: Float[ndarray, "columns time levels parts sites"]) -> Float[ndarray, "rows columns"]:
-        """Write arrays in the shape of the readings as columns: what was seen, in units of the noise."""
+        """Return arrays in the shape of the readings as columns: what was seen, in units of the noise."""
         seen = self.weight > 0
         return np.ascontiguousarray((columns * self.weight)[:, seen].T)
 
     def free(self, columns: Float[ndarray, "rows columns"]) -> Float[ndarray, "rows columns"]:
-        """Take off what the start and the drive can do."""
+        """Return columns without what the start and the drive can do."""
         return np.asarray(columns - self.own @ (self.own.T @ columns))
 
 
@@ -135,9 +137,10 @@ class Tangent:
 
     Attributes:
         fitted: the model.
-        paths: one a trajectory.
+        paths: one per trajectory.
         residual: what is left of the readings (rows,), in units of the noise, free of what the model can do.
-        raw: the same before the model's own parameters were taken off; they differ as far as the fit is not at its optimum.
+        raw: the same before the model's own parameters were taken off; they differ as far as the fit is not at its
+            optimum.
         known: orthonormal columns of what the model's coefficients and psi can do (rows, known).
         jacobian: the same before that: each parameter's own column (rows, parameters), coefficients first, then psi.
     """
@@ -155,11 +158,11 @@ class Tangent:
         return float(max(len(self.residual) - sum(path.own.shape[1] for path in self.paths) - self.known.shape[1], 1))
 
     def columns(self, make: Callable[[int, Path], Float[ndarray, "rows columns"]]) -> Float[ndarray, "rows columns"]:
-        """Put the columns of all paths under each other, free of starts and drives."""
+        """Return the columns of all paths under each other, free of starts and drives."""
         return np.concatenate([path.free(make(number, path)) for number, path in enumerate(self.paths)])
 
     def new(self, columns: Float[ndarray, "rows columns"]) -> Float[ndarray, "rows columns"]:
-        """Take off what the model can do already; columns that it can do wholly become 0."""
+        """Return columns without what the model can do already; those that it can do wholly become 0."""
         left = np.asarray(columns - self.known @ (self.known.T @ columns))
         left -= self.known @ (self.known.T @ left)
         gone = np.linalg.norm(left, axis=0) <= VISIBLE * np.linalg.norm(columns, axis=0)
@@ -168,14 +171,17 @@ class Tangent:
 
 
 def linearise(fitted: Fitted) -> Tangent:
-    """Follow a fitted model's trajectories with the derivatives of their flow."""
+    """Return the tangent of a fitted model."""
     paths = tuple(_path(fitted, number) for number in range(len(fitted.records)))
     residual = np.concatenate(
         [path.free(path.rows(left[None]))[:, 0] for path, left in zip(paths, fitted.residuals(), strict=True)]
     )
     rough = Tangent(fitted, paths, residual, residual, np.zeros((len(residual), 0)), np.zeros((len(residual), 0)))
     jacobian = np.concatenate(
-        [rough.columns(lambda _, path: path.answer(forces(path))), rough.columns(functools.partial(by_psi, fitted))],
+        [
+            rough.columns(lambda _, path: path.answer(own_forces(path))),
+            rough.columns(functools.partial(by_psi, fitted)),
+        ],
         axis=1,
     )
     known = orthonormal(jacobian)
@@ -183,7 +189,7 @@ def linearise(fitted: Fitted) -> Tangent:
 
 
 def orthonormal(columns: Float[ndarray, "rows columns"]) -> Float[ndarray, "rows rank"]:
-    """Give orthonormal columns with the same span; directions that are the same to rounding count once."""
+    """Return orthonormal columns with the same span; directions that are the same to rounding count once."""
     if columns.shape[1] == 0:
         return columns
     length = np.linalg.norm(columns, axis=0)
@@ -194,8 +200,8 @@ def orthonormal(columns: Float[ndarray, "rows columns"]) -> Float[ndarray, "rows
     return np.asarray(left[:, values > 1e-7 * values[0]])
 
 
-def forces(path: Path) -> Float[ndarray, "terms fine parts sites"]:
-    """Evaluate the model's own forces along a path, without their coefficients."""
+def own_forces(path: Path) -> Float[ndarray, "terms fine parts sites"]:
+    """Return the model's own forces along a path, without their coefficients."""
     dynamics = path.record.stretches.dynamics
     values = path.sources(dynamics.terms)
     if dynamics.weights is not None:
@@ -208,43 +214,43 @@ def forces(path: Path) -> Float[ndarray, "terms fine parts sites"]:
 
 
 def by_psi(fitted: Fitted, number: int, path: Path) -> Float[ndarray, "rows psi"]:
-    """Give the columns of the parameters that are not coefficients, one change after another."""
-    found = [_by_change(fitted, place, number, path) for place in range(len(fitted.model.changes))]
+    """Return the columns of the parameters that are not coefficients, one effect after another."""
+    found = [_by_effect(fitted, place, number, path) for place in range(len(fitted.model.effects))]
     rows = int(np.sum(path.weight > 0))
     return np.concatenate([np.zeros((rows, 0)), *found], axis=1)
 
 
-def _by_change(fitted: Fitted, place: int, number: int, path: Path) -> ndarray:
-    """Give the columns of one change's psi."""
-    change = fitted.model.changes[place]
+def _by_effect(fitted: Fitted, place: int, number: int, path: Path) -> ndarray:
+    """Return the columns of one effect's psi."""
+    placed = fitted.model.effects[place]
     dynamics = path.record.stretches.dynamics
     state = fitted.solution.state
     rows = int(np.sum(path.weight > 0))
-    if not change.free:
+    if not placed.free:
         return np.zeros((rows, 0))
-    if change.effect.acts in ("offset", "gain", "curve", "clock"):
+    if placed.effect.acts in ("offset", "gain", "curve", "clock"):
         levels = path.weight.shape[1]
         field = path.field[:: path.steps][:, :levels]
         rate = rates(path.record, state, number)[:, :levels]
-        columns = [change.misreading_by(name, path.record.times, field, rate) for name in change.free]
+        columns = [placed.misreading_by(name, path.record.times, field, rate) for name in placed.free]
         return path.rows(np.stack(columns))
     coefficients = state.coefficients
-    if change.effect.acts == "one equation":
-        assert change.site is not None
-        total = np.tensordot(coefficients, forces(path), (0, 0))
-        mask = np.eye(dynamics.sites)[change.site] / (1 + change.psi["scale"])
+    if placed.effect.acts == "one equation":
+        assert placed.site is not None
+        total = np.tensordot(coefficients, own_forces(path), (0, 0))
+        mask = np.eye(dynamics.sites)[placed.site] / (1 + placed.psi["scale"])
         return path.answer((total * mask[dynamics.moving])[None])
     # Central differences of the force by each parameter; the coefficients stay.
     begin = len(fitted.model.declared.terms)
-    for earlier in fitted.model.changes[:place]:
+    for earlier in fitted.model.effects[:place]:
         begin += len(earlier.forces(dynamics.sites, dynamics.is_complex, number))
     sources = []
-    for name in change.free:
-        value = change.psi[name]
+    for name in placed.free:
+        value = placed.psi[name]
         step = 1e-4 * max(abs(value), 1e-3)
         sides = []
         for sign in (1, -1):
-            moved = change.moved({name: value + sign * step}).forces(dynamics.sites, dynamics.is_complex, number)
+            moved = placed.moved({name: value + sign * step}).forces(dynamics.sites, dynamics.is_complex, number)
             end = begin + len(moved)
             sides.append(force_along(path, moved, coefficients[begin:end]))
         sources.append((sides[0] - sides[1]) / (2 * step))
@@ -252,7 +258,10 @@ def _by_change(fitted: Fitted, place: int, number: int, path: Path) -> ndarray:
 
 
 def force_along(path: Path, forces: Sequence[Force], coefficients: ndarray | None = None) -> ndarray:
-    """Evaluate forces along a path: their sum (fine, parts, sites) with coefficients, or each (forces, fine, parts, sites)."""
+    """Return forces along a path.
+
+    Their sum (fine, parts, sites) where coefficients are given, otherwise each of them (forces, fine, parts, sites).
+    """
     dynamics = path.record.stretches.dynamics
     texts = list(dict.fromkeys(force.term.text for force in forces))
     terms = [read_term(text) for text in texts]
@@ -272,7 +281,7 @@ def force_along(path: Path, forces: Sequence[Force], coefficients: ndarray | Non
 
 
 def _path(fitted: Fitted, number: int) -> Path:
-    """Follow one trajectory on a fine grid."""
+    """Return one fitted trajectory on a fine grid."""
     record, state = fitted.records[number], fitted.solution.state
     stretches = record.stretches
     dynamics = stretches.dynamics
@@ -314,7 +323,10 @@ def _path(fitted: Fitted, number: int) -> Path:
 
 
 def _by_drive(path: Path, fine: Stretches, varied: Transition) -> ndarray:
-    """Give the columns of the splines at unknown ends: what they do to the moving sites, and what is seen of themselves."""
+    """Return the columns of the splines at unknown ends.
+
+    They are what the splines do to the moving sites, and what is seen of themselves.
+    """
     dynamics, drive = fine.dynamics, fine.drive
     assert drive is not None
     assert varied.by_drive is not None

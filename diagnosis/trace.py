@@ -1,18 +1,18 @@
 """Trace what a fitted model leaves to an effect that it lacks.
 
-Every effect of the catalogue is put, to first order, beside the fitted model (`diagnosis.tangent`): at every site that it might sit
-at, on a grid of frequencies, times and delays that it might have. With r the residual (in units of the noise) and U an orthonormal
-basis of what the effect could add, s = |U^T r|^2 is what it would take off |r|^2: the score test (Rao, Proc. Camb. Phil. Soc. 44,
-50 (1948)). An effect with a coefficient for every site or time counts as a random one, of unknown variance: the likelihood is then
-that of a Gaussian residual with a covariance.
+Every effect of the catalogue is put, to first order, beside the fitted model (`diagnosis.tangent`): at every site that
+it might sit at, on a grid of frequencies, times and delays that it might have. With r the residual (in units of the
+noise) and U an orthonormal basis of what the effect could add, s = |U^T r|^2 is what it would take off |r|^2: the score
+test (Rao, Proc. Camb. Phil. Soc. 44, 50 (1948)). An effect with a coefficient for every site or time counts as a random
+one, of unknown variance: the likelihood is then that of a Gaussian residual with a covariance.
 
-The null distribution is simulated: noise of the estimated size is put on the fitted trajectories and the model is fitted to
-it again, by the Gauss-Newton step that the tangent gives; the same search over sites and frequencies is then done on what is left.
-The largest value of a search has an exponential tail; the surrogates say how many independent tries the search amounts to, so
-that p-values far below one over the number of surrogates make sense.
+The null distribution is simulated: noise of the estimated size is put on the fitted trajectories and the model is
+fitted to it again, by the Gauss-Newton step that the tangent gives; the same search over sites and frequencies is then
+done on what is left. The largest value of a search has an exponential tail; the surrogates say how many independent
+candidates the search amounts to, so that p-values far below one over the number of surrogates make sense.
 
-What has no name (`diagnosis.unnamed`, `diagnosis.misreadings`) is tried beside the catalogue. It is no verdict, but where some of it does much better than every effect that has
-a name, none of the names is right.
+Terms without a name (`diagnosis.unnamed`, `diagnosis.misreadings`) are screened beside the catalogue. They are never
+named; but where one of them does much better than every effect of the catalogue, none of these is right.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import special
 
+from latticebench.diagnosis.candidate import Candidate
+from latticebench.diagnosis.catalogued import ROUNDED, candidates_of
 from latticebench.diagnosis.misreadings import misreadings
-from latticebench.diagnosis.model import Change
+from latticebench.diagnosis.placed import PlacedEffect
 from latticebench.diagnosis.tangent import Tangent
 from latticebench.diagnosis.unnamed import unnamed
-from latticebench.diagnosis.ways import ROUNDED, Try, ways
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
@@ -42,26 +43,26 @@ CHUNK = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
-    """What the screen says about one effect.
+class Screened:
+    """What the screen says of one effect, or of an unnamed term.
 
     Attributes:
         name: of the effect, or the text of an unnamed term.
-        change: the best way for it to be there.
-        gain: twice the log likelihood ratio of that way.
+        placed: its best candidate.
+        gain: twice the log likelihood ratio of that one.
         columns: how many coefficients it has.
-        tries: how many independent tries the search amounts to.
-        cost: what the search costs the evidence: the log of the tries, or half the log of the count of numbers for each
+        independent: how many independent candidates the search amounts to.
+        cost: what the search costs the evidence: the log of that number, or half the log of the count of readings per
             parameter searched (as in the Bayesian information criterion) where that is more.
         named: whether it is of the catalogue.
         random: whether it is a random effect, of a coefficient for every site or time.
     """
 
     name: str
-    change: Change
+    placed: PlacedEffect
     gain: float
     columns: int
-    tries: float
+    independent: float
     cost: float
     named: bool = True
     random: bool = False
@@ -69,12 +70,12 @@ class Finding:
     @property
     def searched(self) -> int:
         """How many of its parameters were searched for: a frequency, a time, a delay."""
-        return len(set(self.change.psi) & set(SEARCHED))
+        return len(set(self.placed.psi) & set(SEARCHED))
 
     @property
     def rarity(self) -> float:
         """-ln of the chance p that noise alone does as well somewhere in the search."""
-        return rarity(self._tail, self.tries)
+        return rarity(self._tail, self.independent)
 
     @property
     def p(self) -> float:
@@ -83,7 +84,7 @@ class Finding:
 
     @property
     def evidence(self) -> float:
-        """What the ranking goes by: -ln p of one try, less what the search costs."""
+        """What the ranking goes by: -ln p of one candidate, less what the search costs."""
         return self._tail - self.cost
 
     @property
@@ -92,7 +93,10 @@ class Finding:
 
 
 def tail(gain: float | ndarray, columns: int) -> Any:
-    """-ln of the chance that chi squared of this many degrees of freedom is larger; exact enough far out, too."""
+    """Return -ln of the chance that chi squared of this many degrees of freedom is larger.
+
+    Far out it is that of an asymptotic series, where the chance itself would be 0.
+    """
     half, x = columns / 2, np.maximum(np.asarray(gain, dtype=float), 0.0) / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         near = -np.log(special.gammaincc(half, x))
@@ -106,45 +110,48 @@ def tail(gain: float | ndarray, columns: int) -> Any:
     return np.where(x > 300 + 4 * half, far, near)
 
 
-def rarity(largest: float, tries: float) -> float:
-    """-ln of the chance that the largest of so many independent tries is larger."""
-    if largest > np.log(tries) + 30:
-        return float(largest - np.log(tries))
-    return float(-np.log(max(-np.expm1(tries * np.log1p(-min(np.exp(-largest), 1 - 1e-15))), 1e-300)))
+def rarity(largest: float, count: float) -> float:
+    """-ln of the chance that the largest of so many independent count is larger."""
+    if largest > np.log(count) + 30:
+        return float(largest - np.log(count))
+    return float(-np.log(max(-np.expm1(count * np.log1p(-min(np.exp(-largest), 1 - 1e-15))), 1e-300)))
 
 
-# The search ---------------------------------------------------------------------------------------------------------------------
+# The search -----------------------------------------------------------------------------------------------------------
 
 
 def screen(
     tangent: Tangent, catalogue: Sequence[Effect], draw: np.random.Generator, surrogates: int = 200
-) -> list[Finding]:
-    """Try every effect and the unnamed terms; the best first."""
+) -> list[Screened]:
+    """Return what the candidates of every effect and unnamed term explain, the best first."""
     model = tangent.fitted.model
-    groups: list[tuple[str, bool, list[Try]]] = []
+    groups: list[tuple[str, bool, list[Candidate]]] = []
     for effect in catalogue:
-        if not _addable(effect, model.changes):
+        if not _addable(effect, model.effects):
             continue
-        found = ways(tangent, effect)
+        found = candidates_of(tangent, effect)
         if found:
             groups.append((effect.name, True, found))
-    groups += [(name, False, tries) for name, tries in (*unnamed(tangent), *misreadings(tangent))]
+    groups += [(name, False, candidates) for name, candidates in (*unnamed(tangent), *misreadings(tangent))]
     return rank(tangent, groups, draw, surrogates)
 
 
 def variance_gain(tangent: Tangent, effect: Effect) -> float:
-    """Give twice the log likelihood ratio of the best variance that a random effect's coefficients may have; 0 where it is none."""
-    tries = [one for one in ways(tangent, effect) if one.spread is not None]
+    """Return twice the log likelihood ratio of the best variance that a random effect's coefficients may have.
+
+    0 where the effect has no random coefficients.
+    """
+    candidates = [one for one in candidates_of(tangent, effect) if one.spread is not None]
     scores = _scores(
-        [(effect.name, True, tries)], tangent.residual[:, None], float(np.sum(tangent.residual**2)), tangent.spare
+        [(effect.name, True, candidates)], tangent.residual[:, None], float(np.sum(tangent.residual**2)), tangent.spare
     )
-    return float(np.max(scores[0][0], initial=0.0)) if tries else 0.0
+    return float(np.max(scores[0][0], initial=0.0)) if candidates else 0.0
 
 
 def rank(
-    tangent: Tangent, groups: Sequence[tuple[str, bool, list[Try]]], draw: np.random.Generator, surrogates: int
-) -> list[Finding]:
-    """Score groups of tries on the residual and on surrogates."""
+    tangent: Tangent, groups: Sequence[tuple[str, bool, list[Candidate]]], draw: np.random.Generator, surrogates: int
+) -> list[Screened]:
+    """Return what groups of candidates explain of the residual, compared with surrogates; the best group first."""
     spare = tangent.spare
     rows = len(tangent.residual)
     own = _scores(groups, tangent.residual[:, None], float(np.sum(tangent.residual**2)), spare)
@@ -156,29 +163,29 @@ def rank(
         done += noise.shape[1]
         for kept, (_, best, _) in zip(values, _scores(groups, noise, np.sum(noise**2, axis=0), spare), strict=True):
             kept.append(np.max(best, axis=0))
-    findings = []
-    for (name, named, tries), (gains, best, columns), null in zip(groups, own, values, strict=True):
+    screened = []
+    for (name, named, candidates), (gains, best, columns), null in zip(groups, own, values, strict=True):
         chosen = int(np.argmax(best[:, 0]))
         # The largest of m exponential variables has the mean ln m + 0.577 (Euler's constant) for large m.
         mean = float(np.mean(np.concatenate(null)))
-        count = float(np.clip(np.exp(mean - 0.5772) if mean > 1.3 else mean, 1.0, 10.0 * len(tries) + 1))
-        change = _with_spread(tangent, tries[chosen])
-        searched = len(set(change.psi) & set(SEARCHED))
+        count = float(np.clip(np.exp(mean - 0.5772) if mean > 1.3 else mean, 1.0, 10.0 * len(candidates) + 1))
+        placed = _with_spread(tangent, candidates[chosen])
+        searched = len(set(placed.psi) & set(SEARCHED))
         cost = max(np.log(count), searched * np.log(tangent.fitted.count) / 2)
         gain = float(gains[chosen, 0])
-        if "step" in change.psi and change.psi["step"] ** 2 / 12 > ROUNDED * float(tangent.fitted.sigma[0]) ** 2:
+        if "step" in placed.psi and placed.psi["step"] ** 2 / 12 > ROUNDED * float(tangent.fitted.sigma[0]) ** 2:
             gain = max(gain, CERTAIN)
-        findings.append(
-            Finding(
-                name, change, gain, columns[chosen], count, float(cost), named,
-                tries[chosen].spread is not None,
+        screened.append(
+            Screened(
+                name, placed, gain, columns[chosen], count, float(cost), named,
+                candidates[chosen].spread is not None,
             )
         )  # fmt: skip
-    return sorted(findings, key=lambda one: -one.evidence)
+    return sorted(screened, key=lambda one: -one.evidence)
 
 
 def surrogate_residuals(tangent: Tangent, draw: np.random.Generator, count: int) -> ndarray:
-    """Draw what refits leave of pure noise: (rows, count)."""
+    """Return draws of what refits leave of pure noise (rows, count)."""
     noise = draw.normal(size=(len(tangent.residual), count))
     pieces, begin = [], 0
     for path in tangent.paths:
@@ -190,17 +197,17 @@ def surrogate_residuals(tangent: Tangent, draw: np.random.Generator, count: int)
 
 
 def _scores(
-    groups: Sequence[tuple[str, bool, list[Try]]], residual: ndarray, total: Any, spare: float
+    groups: Sequence[tuple[str, bool, list[Candidate]]], residual: ndarray, total: Any, spare: float
 ) -> list[tuple[ndarray, ndarray, list[int]]]:
-    """For each group: likelihood gains (tries, draws), their tails, and the number of coefficients of each try."""
+    """Return, per group, likelihood gains (candidates, draws), their tails, and numbers of coefficients."""
     if not groups:
         return []
-    every = np.concatenate([one.basis for _, _, tries in groups for one in tries], axis=1)
+    every = np.concatenate([one.basis for _, _, candidates in groups for one in candidates], axis=1)
     scores = every.T @ residual
     found, begin = [], 0
-    for _, _, tries in groups:
+    for _, _, candidates in groups:
         gains, tails, columns = [], [], []
-        for one in tries:
+        for one in candidates:
             end = begin + one.basis.shape[1]
             gain = _gain(scores[begin:end], one.spread, total, spare)
             count = 1 if one.spread is not None else one.basis.shape[1]
@@ -216,7 +223,7 @@ def _scores(
 def _gain(
     scores: Float[ndarray, "q draws"], spread: ndarray | None, total: Any, spare: float
 ) -> Float[ndarray, " draws"]:
-    """Twice the log likelihood ratio, the noise's size being fitted too."""
+    """Return twice the log likelihood ratio, the noise's size being fitted, too."""
     if spread is None:
         share = np.minimum(np.sum(scores**2, axis=0) / total, 1 - 1e-12)
         return np.asarray(-spare * np.log1p(-share))
@@ -225,7 +232,7 @@ def _gain(
 
 
 def variances(spread: Float[ndarray, " q"]) -> Float[ndarray, " variances"]:
-    """Give the variances that a random effect is tried with."""
+    """Return the variances that a random effect is screened with."""
     return np.asarray(np.geomspace(0.03, 3e4, 25) / np.mean(spread))
 
 
@@ -235,18 +242,18 @@ def _random_gain(variance: float, scores: ndarray, spread: ndarray, total: Any, 
     return np.asarray(-spare * np.log1p(-share) - np.sum(np.log1p(ratio)))
 
 
-def _with_spread(tangent: Tangent, one: Try) -> Change:
-    """Say how widely a random effect's coefficients scatter."""
+def _with_spread(tangent: Tangent, one: Candidate) -> PlacedEffect:
+    """Return a candidate's effect, with the spread of its coefficients where they are random."""
     if one.spread is None:
-        return one.change
+        return one.placed
     scores, total = (one.basis.T @ tangent.residual)[:, None], float(np.sum(tangent.residual**2))
-    tried = variances(one.spread)
-    best = tried[int(np.argmax([_random_gain(v, scores, one.spread, total, tangent.spare)[0] for v in tried]))]
+    sizes = variances(one.spread)
+    best = sizes[int(np.argmax([_random_gain(v, scores, one.spread, total, tangent.spare)[0] for v in sizes]))]
     ratio = best * one.spread
-    return replace(one.change, spread=float(np.sqrt(best)), effective=float(np.sum(ratio / (1 + ratio))))
+    return replace(one.placed, spread=float(np.sqrt(best)), effective=float(np.sum(ratio / (1 + ratio))))
 
 
-def _addable(effect: Effect, present: Sequence[Change]) -> bool:
-    """Say whether an effect may be added once more."""
+def _addable(effect: Effect, present: Sequence[PlacedEffect]) -> bool:
+    """Return whether an effect may be added once more."""
     again = ("one site", "one equation", "harmonic", "pulse", "offset", "gain")
-    return effect.acts in again or all(change.effect.name != effect.name for change in present)
+    return effect.acts in again or all(placed.effect.name != effect.name for placed in present)

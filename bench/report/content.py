@@ -17,7 +17,8 @@ from latticebench.bench.report.separation import Separation, separations
 from latticebench.bench.report.whereabouts import Whereabouts, scaled_residuals, whereabouts
 
 if TYPE_CHECKING:
-    from latticebench.diagnosis.repair import Diagnosis, Round
+    from latticebench.diagnosis.repair import Diagnosis
+    from latticebench.diagnosis.search import Round
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unexplained"]
 
@@ -204,7 +205,7 @@ def _recording(diagnosis: Diagnosis) -> Recording:
 
 def _turn(one: Round) -> Turn:
     ranking = [
-        Ranked(effect=entry.name, evidence=entry.evidence, p=entry.p, named=entry.finding.named)
+        Ranked(effect=entry.name, evidence=entry.evidence, p=entry.p, named=entry.screened.named)
         for entry in one.ranking
     ]
     return Turn(added=one.added, equal=one.equal, ranking=tuple(ranking))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
     from latticebench.diagnosis.repair import Diagnosis
-    from latticebench.diagnosis.residual import Forecast
+    from latticebench.diagnosis.residual import Prediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +74,8 @@ class Forecasts:
     trajectory: int
     trajectories: int
     site: int
-    before: Forecast
-    after: Forecast | None
+    before: Prediction
+    after: Prediction | None
     moving: slice
     noise: float
 
@@ -105,7 +105,7 @@ def _residuals(diagnosis: Diagnosis) -> Residuals:
         omega, power, _ = spectrum(t, values)
         return ResidualCurve(t, values[:, level], omega, power)
 
-    after = scaled_residuals(course.after, diagnosis)[number] if course.after.model.changes else None
+    after = scaled_residuals(course.after, diagnosis)[number] if course.after.model.effects else None
     return Residuals(
         "uv"[level], number + 1, len(before), curve(*before[number]), None if after is None else curve(*after)
     )
@@ -120,13 +120,13 @@ def _forecasts(diagnosis: Diagnosis) -> Forecasts:
     first = range(before[number].seen.shape[-1])[moving][0]
     return Forecasts(
         number + 1, len(before), first + int(np.argmax(sizes[number])) + 1, before[number],
-        after[number] if diagnosis.course.after.model.changes else None, moving, float(diagnosis.noise[0]),
+        after[number] if diagnosis.course.after.model.effects else None, moving, float(diagnosis.noise[0]),
     )  # fmt: skip
 
 
-def _joined(forecasts: Sequence[Forecast]) -> list[Forecast]:
+def _joined(forecasts: Sequence[Prediction]) -> list[Prediction]:
     """Return the forecasts of trajectories, whose pieces are put together with gaps between them."""
-    found: list[Forecast] = []
+    found: list[Prediction] = []
     for one in forecasts:
         if not found or one.t[0] <= found[-1].t[-1]:
             found.append(one)
@@ -142,7 +142,7 @@ def _joined(forecasts: Sequence[Forecast]) -> list[Forecast]:
     return found
 
 
-def forecast_error(one: Forecast, moving: slice, axis: tuple[int, int]) -> np.ndarray:
+def forecast_error(one: Prediction, moving: slice, axis: tuple[int, int]) -> np.ndarray:
     """Return the RMS of a forecast's error at the sites that have an equation; NaN where nothing was read."""
     seen = np.isfinite(one.seen[..., moving])
     with np.errstate(all="ignore"):

@@ -17,7 +17,8 @@ from latticebench.bench.report.mathematics import (
     mathml_summand,
     text_of_sum,
 )
-from latticebench.diagnosis.model import Change, Fitted
+from latticebench.diagnosis.model import Fitted
+from latticebench.diagnosis.placed import PlacedEffect
 from latticebench.systems.effects import INSTRUMENT
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ def _everywhere(fitted: Fitted) -> list[tuple[str | None, str, float, sympy.Expr
     found: list[tuple[str | None, str, float, sympy.Expr]] = [
         (None, text, value, expression(text)) for text, value in zip(texts, values[: len(texts)], strict=True)
     ]
-    for change, block in zip(fitted.model.changes, blocks(fitted), strict=True):
+    for change, block in zip(fitted.model.effects, blocks(fitted), strict=True):
         if change.effect.acts in ("one site", "every site") or change.as_force:
             continue
         named = [_text(change, label) for label in labels(change, fitted)]
@@ -99,7 +100,7 @@ def _everywhere(fitted: Fitted) -> list[tuple[str | None, str, float, sympy.Expr
     return found
 
 
-def _text(change: Change, label: str) -> str:
+def _text(change: PlacedEffect, label: str) -> str:
     """Return a label so that it can stand in a product."""
     lead = "i*" if label.startswith("i*") else ""
     if change.effect.acts == "delayed":
@@ -109,7 +110,7 @@ def _text(change: Change, label: str) -> str:
     return label
 
 
-def bodies(change: Change) -> list[sympy.Expr]:
+def bodies(change: PlacedEffect) -> list[sympy.Expr]:
     """Return what each coefficient of an effect that acts at every site is multiplied with."""
     import sympy
 
@@ -147,7 +148,7 @@ def _pulse(t: sympy.Symbol, at: float, width: float) -> sympy.Expr:
 def _elsewhere(fitted: Fitted) -> list[str]:
     """Return what acts at single sites, at the ends and on the readings, one sentence each."""
     found = []
-    for change, block in zip(fitted.model.changes, blocks(fitted), strict=True):
+    for change, block in zip(fitted.model.effects, blocks(fitted), strict=True):
         values = [float(value) for value in fitted.solution.state.coefficients[block]]
         if change.effect.acts in INSTRUMENT:
             found += _misread(change, values, fitted.data[0].is_complex)
@@ -158,7 +159,7 @@ def _elsewhere(fitted: Fitted) -> list[str]:
     return found
 
 
-def _local(change: Change, values: list[float]) -> list[str]:
+def _local(change: PlacedEffect, values: list[float]) -> list[str]:
     """Return what an effect does that acts at one site, or differently at each."""
     acts = change.effect.acts
     if acts == "one site" and change.site is not None:
@@ -183,7 +184,7 @@ def _local(change: Change, values: list[float]) -> list[str]:
     return []
 
 
-def _misread(change: Change, values: list[float], is_complex: bool) -> list[str]:
+def _misread(change: PlacedEffect, values: list[float], is_complex: bool) -> list[str]:
     """Return what the instrument makes of the readings."""
     acts, psi = change.effect.acts, change.psi
     if change.as_force and len(values) <= LISTED:

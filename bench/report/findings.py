@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.report.document import Content, Number
-from latticebench.diagnosis.model import Change, Fitted
+from latticebench.diagnosis.model import Fitted
+from latticebench.diagnosis.placed import PlacedEffect
 from latticebench.systems.effects import INSTRUMENT
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def added(diagnosis: Diagnosis) -> tuple[AddedEffect, ...]:
     fitted = course.after
     errors = np.sqrt(np.maximum(np.diag(fitted.solution.covariance), 0.0))
     found = []
-    pieces = zip(fitted.model.changes, blocks(fitted), course.equal, strict=True)
+    pieces = zip(fitted.model.effects, blocks(fitted), course.equal, strict=True)
     for number, (change, block, equal) in enumerate(pieces):
         names = labels(change, fitted)
         coefficients = dict(zip(names, map(float, fitted.solution.state.coefficients[block]), strict=True))
@@ -92,14 +93,14 @@ def blocks(fitted: Fitted) -> list[slice]:
     """Return which coefficients of a fit are those of each added effect."""
     samples = fitted.data[0]
     begin, found = len(fitted.model.declared.terms), []
-    for change in fitted.model.changes:
+    for change in fitted.model.effects:
         end = begin + len(change.forces(samples.sites, samples.is_complex))
         found.append(slice(begin, end))
         begin = end
     return found
 
 
-def labels(change: Change, fitted: Fitted) -> list[str]:
+def labels(change: PlacedEffect, fitted: Fitted) -> list[str]:
     """Return a text for each coefficient of an added effect."""
     samples = fitted.data[0]
     found = [force.label for force in change.forces(samples.sites, samples.is_complex)]
@@ -107,7 +108,7 @@ def labels(change: Change, fitted: Fitted) -> list[str]:
     return [label.removesuffix("*1") if label.endswith("i*1") else label for label in found]
 
 
-def reading(change: Change, name: str, is_complex: bool) -> str:
+def reading(change: PlacedEffect, name: str, is_complex: bool) -> str:
     """Return what a parameter of the instrument is, with the names of the file's columns."""
     kind, _, number = name.partition("_")
     if change.effect.acts == "clock":

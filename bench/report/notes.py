@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.report.whereabouts import scaled_residuals
-from latticebench.diagnosis.repair import EQUAL
-from latticebench.diagnosis.ways import step_of
+from latticebench.diagnosis.catalogued import step_of
+from latticebench.diagnosis.contest import EQUAL
 from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def _parts(field: np.ndarray) -> np.ndarray:
 
 def _of_the_rounds(diagnosis: Diagnosis) -> Iterator[str]:
     course = diagnosis.course
-    kept = {change.effect.name for change in course.after.model.changes}
+    kept = {change.effect.name for change in course.after.model.effects}
     gone = list(dict.fromkeys(one.added for one in course.rounds if one.added and one.added not in kept))
     if gone:
         yield f"Added in a round and taken away again, since later ones do without: {', '.join(gone)}."
@@ -84,7 +84,7 @@ def _of_the_fits(diagnosis: Diagnosis) -> Iterator[str]:
     course = diagnosis.course
     for fitted, name in ((course.before, "declared equation"), (course.after, "last model")):
         pieces, whole = len(fitted.data), len(scaled_residuals(fitted, diagnosis))
-        if pieces > whole and (fitted is course.after or course.after.model.changes):
+        if pieces > whole and (fitted is course.after or course.after.model.effects):
             yield (
                 f"The {name} is followed in {pieces} pieces of at most {max(len(one.t) for one in fitted.data)} "
                 "samples, each from a start of its own: over longer ones it loses the readings."
@@ -99,7 +99,7 @@ def _of_the_names(diagnosis: Diagnosis) -> Iterator[str]:
     course = diagnosis.course
     unnamed = [one for one in course.left if not one.named]
     if unnamed and course.verdict in ("unexplained", "partly explained"):
-        places = ["" if one.change.site is None else f" (site {one.change.site + 1})" for one in unnamed]
+        places = ["" if one.placed.site is None else f" (site {one.placed.site + 1})" for one in unnamed]
         listed = ", ".join(one.name + place for one, place in zip(unnamed[:3], places, strict=False))
         yield f"What would do most for what is left, though it is no effect of the catalogue: {listed}."
     for name in course.repeated:
@@ -114,5 +114,5 @@ def _of_the_names(diagnosis: Diagnosis) -> Iterator[str]:
             "natural logarithms of the likelihood ratio), though it is no effect of the catalogue: the name is in "
             "doubt."
         )
-    if any(change.effect.acts == "clock" for change in course.after.model.changes):
+    if any(change.effect.acts == "clock" for change in course.after.model.effects):
         yield "How late a row to come will be read cannot be known: the forecast is for the times as they are told."

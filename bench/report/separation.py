@@ -28,14 +28,14 @@ def separations(diagnosis: Diagnosis) -> tuple[Separation, ...]:
     """Return each added effect with each one that cannot be told from it."""
     course = diagnosis.course
     model, is_complex = course.after.model, course.after.data[0].is_complex
-    effects = {entry.name: entry.finding.change.effect for one in course.rounds for entry in one.ranking}
-    effects |= {change.effect.name: change.effect for change in model.changes}
+    effects = {entry.name: entry.screened.placed.effect for one in course.rounds for entry in one.ranking}
+    effects |= {change.effect.name: change.effect for change in model.effects}
     return tuple(
         Separation(
             effect=change.effect.name, other=name,
             measurement=separation(change.effect, effects[name], model.order, is_complex),
         )
-        for change, equal in zip(model.changes, course.equal, strict=True)
+        for change, equal in zip(model.effects, course.equal, strict=True)
         for name in equal
     )  # fmt: skip
 

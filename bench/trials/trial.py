@@ -17,12 +17,13 @@ from latticebench import systems
 from latticebench.bench.axes import Listed, Seeds
 from latticebench.bench.case import Case, Folders, Number, Roots, Settings
 from latticebench.bench.trials import faults, specimen
-from latticebench.bench.trials.specimen import Specimen
-from latticebench.diagnosis.model import Change
-from latticebench.diagnosis.repair import Diagnosis, diagnose, polish
-from latticebench.diagnosis.residual import alike, forecast, pooled
+from latticebench.bench.trials.specimen import Conditions, Specimen
+from latticebench.diagnosis.catalogued import candidates_of
+from latticebench.diagnosis.placed import PlacedEffect
+from latticebench.diagnosis.polish import polish
+from latticebench.diagnosis.repair import Diagnosis, diagnose
+from latticebench.diagnosis.residual import alike, pooled, predict
 from latticebench.diagnosis.tangent import linearise
-from latticebench.diagnosis.ways import ways
 from latticebench.methods.method import Skipped
 from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.errors import InputError, unknown
@@ -90,14 +91,12 @@ class Trial(Case):
         declared = system.library("equation")
         one = self.recording(system)
         wall, cpu = time.perf_counter(), time.process_time()
-        diagnosis = diagnose(
-            declared, system.order, [replace(one.samples, ends=system.ends)], CATALOGUE, self.seed,
-            truth=system.truth(declared, {}),
-        )  # fmt: skip
+        data = [replace(one.samples, ends=system.ends)]
+        diagnosis = diagnose(declared, system.order, data, CATALOGUE, self.seed).against(system.truth(declared, {}))
         found.update(seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
         found.update(size=one.z, apart=one.apart, about=dict(one.about), **_errors(diagnosis, one.samples.sigma))
         course = diagnosis.course
-        named = [change.effect.name for change in course.after.model.changes]
+        named = [change.effect.name for change in course.after.model.effects]
         alike = [list(names) for names in course.equal]
         wanted = wanted_names(self.effect)
         found.update(
@@ -116,10 +115,10 @@ class Trial(Case):
         """
         draw = np.random.default_rng([self.seed, zlib.crc32(self.effect.encode())])
         try:
-            one = specimen.make(
-                system, self.effect, self.z, draw, sites=self.sites, samples=self.samples, noise=self.noise,
-                velocities=self.velocities, variation=True,
-            )  # fmt: skip
+            conditions = Conditions(
+                sites=self.sites, samples=self.samples, noise=self.noise, velocities=self.velocities, variation=True
+            )
+            one = specimen.make(system, self.effect, self.z, draw, conditions)
         except InputError as error:
             raise Skipped(str(error)) from None
         if self.effect != faults.NONE and self.effect not in OWN_SIZE and abs(one.z / self.z - 1) > OFF_SIZE:
@@ -194,11 +193,11 @@ def _forecast_of_truth(one: Specimen, found: Diagnosis) -> float | None:
     """
     course = found.course
     before = alike(course.before, course.after)
-    near = [way.change for way in ways(linearise(before), find(one.effect)) if not way.change.as_force]
+    near = [way.placed for way in candidates_of(linearise(before), find(one.effect)) if not way.placed.as_force]
     if not near:
         return None
 
-    def distance(change: Change) -> tuple[Any, ...]:
+    def distance(change: PlacedEffect) -> tuple[Any, ...]:
         away = sum(abs(value - one.about[name]) for name, value in change.psi.items() if name in one.about)
         place = change.site not in (None, int(one.about["site"]))
         # What was made has faults of u and v alike, jitter rather than a slow clock, and these other ends.
@@ -207,8 +206,8 @@ def _forecast_of_truth(one: Specimen, found: Diagnosis) -> float | None:
     chosen = min(near, key=distance)
     true = chosen.moved({name: float(one.about[name]) for name in chosen.psi if name in one.about})
     with threadpool_limits(1):
-        fitted = polish(before.model.with_change(true), before)
-        return None if fitted is None else pooled(forecast(fitted))
+        fitted = polish(before.model.with_effect(true), before)
+        return None if fitted is None else pooled(predict(fitted))
 
 
 def is_right(effect: str, named: list[str], alike: list[list[str]], verdict: str) -> bool:

@@ -50,9 +50,9 @@ from latticebench.bench.publish import format_number, render
 from latticebench.bench.trials import faults, specimen
 from latticebench.bench.trials.trial import OFF_SIZE
 from latticebench.diagnosis import trace
+from latticebench.diagnosis.catalogued import candidates_of
 from latticebench.diagnosis.model import Fitted, Model, first_fit
-from latticebench.diagnosis.tangent import Path, Tangent, forces, linearise, orthonormal
-from latticebench.diagnosis.ways import ways
+from latticebench.diagnosis.tangent import Path, Tangent, linearise, orthonormal, own_forces
 from latticebench.methods.engine.errors_in_variables import ROUNDS, estimate
 from latticebench.methods.engine.shooting import Solution, State
 from latticebench.methods.engine.weak_form import ACCURACY, WeakForm, linearised
@@ -120,7 +120,7 @@ def along(
     (record,) = model.records([samples])
     none = np.zeros((0, 0, 0))
     path = Along(record, times, 1, field, none, none, none, none, None, project)
-    declared = forces(path)
+    declared = own_forces(path)
     if residual is None:
         assert rate is not None
         residual = project((rate - np.tensordot(coefficients, declared, (0, 0)))[None])[:, 0]
@@ -192,9 +192,9 @@ METHODS: dict[str, Callable[[Model, Samples], Tangent]] = {
 }  # fmt: skip
 
 
-def findings(tangent: Tangent) -> list[trace.Finding]:
+def findings(tangent: Tangent) -> list[trace.Screened]:
     """Rank the effects of the catalogue that are forces by their evidence, the best first."""
-    groups = [(effect.name, True, ways(tangent, effect)) for effect in CANDIDATES]
+    groups = [(effect.name, True, candidates_of(tangent, effect)) for effect in CANDIDATES]
     return trace.rank(tangent, [one for one in groups if one[2]], np.random.default_rng(1), SURROGATES)
 
 
@@ -233,7 +233,7 @@ def run() -> pd.DataFrame:
         for effect, z, seed in itertools.product(effects(system), SIZES, SEEDS):
             draw = np.random.default_rng([seed, zlib.crc32(effect.encode())])
             try:
-                one = specimen.make(system, effect, z, draw, noise=NOISE, variation=True)
+                one = specimen.make(system, effect, z, draw, specimen.Conditions(noise=NOISE, variation=True))
             except InputError:
                 continue
             if abs(one.z / z - 1) > OFF_SIZE:

@@ -13,7 +13,7 @@ import pytest
 
 from latticebench import systems
 from latticebench.bench import cli
-from latticebench.bench.trials.specimen import make
+from latticebench.bench.trials.specimen import Conditions, make
 from latticebench.systems.readers import read
 from latticebench.systems.samples import Samples
 from latticebench.systems.writers import write
@@ -40,7 +40,7 @@ orders = [2]
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A damped phi^4 lattice, a later recording of it, and files that do not fit."""
     place = tmp_path_factory.mktemp("diagnose")
-    specimen = make(systems.find("phi4"), "damping", 30, np.random.default_rng(3), sites=9, samples=40)
+    specimen = make(systems.find("phi4"), "damping", 30, np.random.default_rng(3), Conditions(sites=9, samples=40))
     write([specimen.samples], place / "damped.csv")
     samples = specimen.samples
     assert samples.v is not None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from latticebench import systems
-from latticebench.bench.trials.specimen import make
+from latticebench.bench.trials.specimen import Conditions, make
 from latticebench.diagnosis.coherence import coherence, farthest
 from latticebench.diagnosis.model import Model, first_fit
 from latticebench.diagnosis.repair import diagnose
@@ -19,7 +19,7 @@ from latticebench.systems.effects import find
 
 def tangent_of(name, missing=0.0):
     system = systems.find(name)
-    one = make(system, "none", 0.0, np.random.default_rng(4), sites=9, samples=40, span=8.0, variation=True)
+    one = make(system, "none", 0.0, np.random.default_rng(4), Conditions(sites=9, samples=40, span=8.0, variation=True))
     samples = one.samples.observed()
     u = np.where(np.random.default_rng(0).uniform(size=samples.u.shape) < missing, np.nan, samples.u)
     data = [replace(samples, u=u, ends=system.ends)]
@@ -71,17 +71,19 @@ def test_a_reading_far_out_is_seen_at_its_site_and_those_of_noise_are_not(name, 
     spike = tangent.new(path.free(path.rows(far[None])))[:, 0]
     found = farthest(replace(tangent, residual=draws[0] + spike))
     assert found.p < 1e-4
-    assert found.change.site == row
+    assert found.placed.site == row
 
 
-def test_a_fault_that_no_term_comes_near_is_unexplained_all_the_same(monkeypatch):
+def test_an_effect_that_no_term_comes_near_is_unexplained_all_the_same(monkeypatch):
     """With nothing to compare with but one effect that is not there."""
     monkeypatch.setattr("latticebench.diagnosis.trace.unnamed", lambda _: [])
     monkeypatch.setattr("latticebench.diagnosis.trace.misreadings", lambda _: [])
     system = systems.find("sine-gordon")
     verdicts = []
     for effect, z in (("none", 0.0), ("other: noise-force", 40.0)):
-        one = make(system, effect, z, np.random.default_rng(8), sites=9, samples=40, span=8.0, variation=True)
+        one = make(
+            system, effect, z, np.random.default_rng(8), Conditions(sites=9, samples=40, span=8.0, variation=True)
+        )
         data = [replace(one.samples.observed(), ends=system.ends)]
         found = diagnose(system.library("equation"), 2, data, [find("dry-friction")])
         verdicts.append(found.course.verdict)

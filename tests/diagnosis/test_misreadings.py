@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from latticebench import systems
-from latticebench.bench.trials.specimen import make
+from latticebench.bench.trials.specimen import Conditions, make
 from latticebench.diagnosis import misreadings
 from latticebench.diagnosis.model import Model, first_fit
 from latticebench.diagnosis.tangent import linearise
@@ -20,7 +20,7 @@ from latticebench.systems.effects import CATALOGUE
 @functools.cache
 def tangent_of(name):
     system = systems.find(name)
-    one = make(system, "none", 0.0, np.random.default_rng(4), sites=9, samples=30, span=6.0, variation=True)
+    one = make(system, "none", 0.0, np.random.default_rng(4), Conditions(sites=9, samples=30, span=6.0, variation=True))
     data = [replace(one.samples.observed(), ends=system.ends)]
     return linearise(first_fit(Model(system.library("equation"), system.order), data))
 
@@ -77,7 +77,7 @@ def heaved(u, _rate):
 
 @pytest.mark.parametrize("name", ["phi4", "ginzburg-landau"])
 @pytest.mark.parametrize(
-    ("fault", "found", "site"),
+    ("error", "found", "site"),
     [
         (sticking, "readings wrong by a function of the rate", None),
         (humming, "a hum in all readings", None),
@@ -92,23 +92,23 @@ def heaved(u, _rate):
         (drifting, "readings of u at one site wrong by any course", 3),
     ],
 )
-def test_a_fault_of_an_instrument_is_found_as_what_it_is(name, fault, found, site):
+def test_an_error_of_an_instrument_is_found_as_what_it_is(name, error, found, site):
     tangent = tangent_of(name)
     path = tangent.paths[0]
     field = path.field[:: path.steps]
     rate = np.gradient(path.field[:, 0], path.times, axis=0)[:: path.steps]
-    wrong = np.stack(fault(field[:, 0], rate)[: path.weight.shape[1]], axis=1)
+    wrong = np.stack(error(field[:, 0], rate)[: path.weight.shape[1]], axis=1)
     column = tangent.new(path.free(path.rows(wrong[None])))[:, 0]
     faulty = replace(tangent, residual=tangent.residual + 30 * column / np.linalg.norm(column))
     first = screen(faulty, CATALOGUE, np.random.default_rng(0), 40)[0]
     assert first.name == found
-    assert first.change.site == site
+    assert first.placed.site == site
 
 
 def test_sensors_that_are_each_a_little_off_follow_no_smooth_course():
     """Scales of 25 sensors without a pattern are the sensors' own, and those of a slant are not."""
     system = systems.find("phi4")
-    one = make(system, "none", 0.0, np.random.default_rng(4), variation=True)
+    one = make(system, "none", 0.0, np.random.default_rng(4), Conditions(variation=True))
     data = [replace(one.samples.observed(), ends=system.ends)]
     tangent = linearise(first_fit(Model(system.library("equation"), system.order), data))
     path = tangent.paths[0]
@@ -128,8 +128,8 @@ def test_velocities_are_the_slopes_of_what_the_field_is_read_as(monkeypatch):
     """A reading of u**3 goes with one of 3 u**2 v."""
     tangent = tangent_of("phi4")
     caught = []
-    monkeypatch.setattr(misreadings, "attempt", lambda _tangent, _change, columns, **_: caught.append(columns))
-    misreadings._law(tangent, lambda _path, u: u[None] ** 3, random=False)
+    monkeypatch.setattr(misreadings, "as_candidate", lambda _tangent, _change, columns, **_: caught.append(columns))
+    misreadings.by_law(tangent, lambda _path, u: u[None] ** 3, random=False)
     path = tangent.paths[0]
     u, v = (one[:: path.steps] for one in path.fields())
     for slopes, columns in zip((0 * v, 3 * u**2 * v), caught, strict=True):

@@ -12,10 +12,14 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 from latticebench import systems
-from latticebench.bench.trials.specimen import make
+from latticebench.bench.trials.specimen import Conditions, make
 from latticebench.diagnosis.model import Model, first_fit
-from latticebench.diagnosis.repair import FORCES, _prune, close, diagnose, polish
-from latticebench.diagnosis.residual import over_noise
+from latticebench.diagnosis.offsets import FORCES
+from latticebench.diagnosis.polish import polish
+from latticebench.diagnosis.reconsider import pruned
+from latticebench.diagnosis.repair import diagnose
+from latticebench.diagnosis.residual import residual_rms
+from latticebench.diagnosis.search import search
 from latticebench.diagnosis.tangent import linearise
 from latticebench.diagnosis.trace import screen
 from latticebench.systems.effects import CATALOGUE, find
@@ -33,10 +37,10 @@ def looped(name, effect, z=30, seed=1, sites=9):
     """A specimen, the loop's course on it, and the true noise on u and v, each real part."""
     system = systems.find(name)
     draw = np.random.default_rng(seed)
-    specimen = make(system, effect, z, draw, sites=sites, samples=40, span=8.0, variation=True)
+    specimen = make(system, effect, z, draw, Conditions(sites=sites, samples=40, span=8.0, variation=True))
     data = [replace(specimen.samples.observed(), ends=system.ends)]
     declared = system.library("equation")
-    course = close(Model(declared, system.order), data, CATALOGUE, np.random.default_rng(0), surrogates=100)
+    course = search(Model(declared, system.order), data, CATALOGUE, np.random.default_rng(0), surrogates=100)
     sigma = [np.std(specimen.samples.u - specimen.clean.u) / np.sqrt(1 + system.is_complex)]
     if system.order == 2:
         sigma.append(np.std(specimen.samples.v - specimen.clean.v))
@@ -44,7 +48,7 @@ def looped(name, effect, z=30, seed=1, sites=9):
 
 
 def names(course):
-    return [change.effect.name for change in course.after.model.changes]
+    return [placed.effect.name for placed in course.after.model.effects]
 
 
 def errors(name, course):
@@ -71,18 +75,18 @@ def test_the_effect_that_is_missing_is_the_one_that_is_added(name, effect):
     assert names(course) == [effect]
     assert course.verdict == "explained"
     assert course.rounds[0].added == effect
-    assert next(one.name for one in course.rounds[0].ranking if one.finding.named) == effect
+    assert next(one.name for one in course.rounds[0].ranking if one.screened.named) == effect
     assert len(course.equal) == 1
     assert len(course.equal[0]) <= 1
     if effect in ("defect", "sensor-offset", "unequal-masses", "sensor-gain"):
-        assert course.after.model.changes[0].site == specimen.about["site"]
+        assert course.after.model.effects[0].site == specimen.about["site"]
 
 
 @pytest.mark.parametrize(("name", "effect"), PAIRS)
 def test_after_the_cure_only_noise_is_left(name, effect):
     _, course, sigma = looped(name, effect)
-    assert over_noise(course.before, sigma) > 1.1
-    assert over_noise(course.after, sigma) == pytest.approx(1, abs=0.1)
+    assert residual_rms(course.before, sigma) > 1.1
+    assert residual_rms(course.after, sigma) == pytest.approx(1, abs=0.1)
     assert course.left == ()
 
 
@@ -94,8 +98,9 @@ def test_after_the_cure_the_declared_coefficients_are_nearer_to_the_truth():
 
 
 @pytest.mark.parametrize(
-    ("name", "effect", "sign"), [("phi4", "damping", -1), ("phi4", "trap", 1), ("phi4", "next-neighbour", 1), ("phi4", "defect", 1)]
-)  # fmt: skip
+    ("name", "effect", "sign"),
+    [("phi4", "damping", -1), ("phi4", "trap", 1), ("phi4", "next-neighbour", 1), ("phi4", "defect", 1)],
+)
 def test_its_coefficient_is_the_one_that_is_in_the_data(name, effect, sign):
     specimen, course, _ = looped(name, effect)
     count = len(course.before.model.declared.terms)
@@ -107,12 +112,12 @@ def test_its_coefficient_is_the_one_that_is_in_the_data(name, effect, sign):
 
 def test_the_parameter_that_was_searched_is_within_its_error():
     specimen, course, _ = looped("phi4", "drive")
-    change = course.after.model.changes[0]
-    assert abs(change.psi["omega"] - specimen.about["omega"]) < 4 * course.after.psi_errors[0]["omega"]
+    placed = course.after.model.effects[0]
+    assert abs(placed.psi["omega"] - specimen.about["omega"]) < 4 * course.after.psi_errors[0]["omega"]
     specimen, course, _ = looped("sine-gordon", "unequal-masses")
-    change = course.after.model.changes[0]
-    assert abs(change.psi["scale"] - np.real(specimen.amount)) < 4 * course.after.psi_errors[0]["scale"]
-    assert course.after.psi_errors[0]["scale"] < abs(change.psi["scale"]) / 10
+    placed = course.after.model.effects[0]
+    assert abs(placed.psi["scale"] - np.real(specimen.amount)) < 4 * course.after.psi_errors[0]["scale"]
+    assert course.after.psi_errors[0]["scale"] < abs(placed.psi["scale"]) / 10
 
 
 @pytest.mark.parametrize("name", ["phi4", "sine-gordon", "dnls", "ginzburg-landau"])
@@ -123,7 +128,7 @@ def test_where_nothing_is_missing_nothing_is_added(name, seed):
     assert names(course) == []
     assert course.after is course.before
     assert course.equal == ()
-    assert over_noise(course.after, sigma) == pytest.approx(1, abs=0.1)
+    assert residual_rms(course.after, sigma) == pytest.approx(1, abs=0.1)
 
 
 OUTSIDE = [
@@ -137,7 +142,7 @@ def test_what_is_outside_the_catalogue_gets_no_wrong_name(name, effect):
     _, course, sigma = looped(name, effect)
     assert course.verdict in ("unexplained", "partly explained")
     assert course.left
-    assert over_noise(course.after, sigma) > 1.1
+    assert residual_rms(course.after, sigma) > 1.1
 
 
 def test_forces_that_no_offset_of_a_sensor_makes_are_not_the_sensors():
@@ -161,7 +166,7 @@ def test_dry_friction_is_named_and_fitted_to_the_end_though_its_sign_jumps():
     assert course.verdict == "explained"
 
 
-# Two at once ------------------------------------------------------------------------------------------------------------------
+# Two at once ----------------------------------------------------------------------------------------------------------
 
 
 def two_at_once():
@@ -203,9 +208,9 @@ def driven_chain(force):
 def test_a_drive_is_found_however_strong_it_is(size):
     found = driven_chain(lambda t: size * np.cos(2.2 * t - 1))
     assert found.course.verdict == "explained"
-    (change,) = found.course.after.model.changes
-    assert change.effect.name == "drive"
-    assert change.psi["omega"] == pytest.approx(2.2, abs=0.05 if size < 0.1 else 0.005)
+    (placed,) = found.course.after.model.effects
+    assert placed.effect.name == "drive"
+    assert placed.psi["omega"] == pytest.approx(2.2, abs=0.05 if size < 0.1 else 0.005)
     assert found.residual[1] < 1.1
 
 
@@ -216,7 +221,7 @@ def test_harmonics_that_stand_for_another_course_are_no_explanation():
 
 
 def test_names_that_leave_the_readings_lost_are_not_given():
-    """Forces as strong as the motion that nothing tells from noise: whatever comes nearest explains next to nothing of them."""
+    """Forces as strong as the motion that look like noise: whatever comes nearest explains next to nothing of them."""
     draw = np.random.default_rng(8)
     t, sites = np.linspace(0, 12, 60), 8
     pushes = CubicSpline(np.linspace(0, 12, 60), 0.8 * draw.normal(size=(60, sites)))
@@ -252,8 +257,8 @@ def test_disorder_has_a_mean_of_its_own_where_the_equation_has_no_such_term():
     system = systems.find("sine-gordon")
     data = Samples(t, noisy[:, :sites], noisy[:, sites:], source="uneven.csv", ends="free")
     found = diagnose(system.library("equation"), 2, [data], CATALOGUE)
-    (change,) = found.course.after.model.changes
-    assert change.effect.name == "disorder"
+    (placed,) = found.course.after.model.effects
+    assert placed.effect.name == "disorder"
     solution = found.course.after.solution
     fitted, error = solution.state.coefficients[2:], np.sqrt(np.diag(solution.covariance))[2:]
     assert len(fitted) == sites
@@ -264,13 +269,13 @@ def test_of_two_effects_at_once_both_are_found_with_their_sizes():
     declared = library("duffing", ["u[n+1]+u[n-1]-2*u[n]", "u[n]", "u[n]**3"])
     truth = np.array([0.9, -1.0, -0.4])
     watched = []
-    found = diagnose(declared, 2, [two_at_once()], CATALOGUE, truth=truth, watcher=watched.append)
+    found = diagnose(declared, 2, [two_at_once()], CATALOGUE, watcher=watched.append).against(truth)
     course = found.course
     assert sorted(names(course)) == ["damping", "sensor-offset"]
     assert course.verdict == "explained"
     assert [one.added for one in course.rounds] == [*names(course), None]
     assert course.after.solution.state.coefficients[3] == pytest.approx(-0.03, abs=0.003)
-    offset = next(one for one in course.after.model.changes if one.effect.name == "sensor-offset")
+    offset = next(one for one in course.after.model.effects if one.effect.name == "sensor-offset")
     assert offset.psi["real_3"] == pytest.approx(0.03, abs=0.003)
     assert found.noise == pytest.approx(0.005, rel=0.1)
     assert found.residual[0] > 1.5
@@ -284,17 +289,19 @@ def test_of_two_effects_at_once_both_are_found_with_their_sizes():
 def test_late_rows_stay_when_another_effect_is_added():
     """However many rows there are, that they are late is one thing: the variance of how late."""
     system = systems.find("phi4")
-    one = make(system, "damping+clock", 13, np.random.default_rng(4), sites=9, samples=40, span=8.0, variation=True)
+    one = make(
+        system, "damping+clock", 13, np.random.default_rng(4), Conditions(sites=9, samples=40, span=8.0, variation=True)
+    )
     data = [replace(one.samples.observed(), ends=system.ends)]
     fitted = first_fit(Model(system.library("equation"), system.order), data)
     for name in ("clock", "damping"):
         found = screen(linearise(fitted), [find(name)], np.random.default_rng(0), 20)
-        change = next(finding.change for finding in found if finding.name == name)
-        with_it = polish(fitted.model.with_change(change), fitted)
+        placed = next(screened.placed for screened in found if screened.name == name)
+        with_it = polish(fitted.model.with_effect(placed), fitted)
         assert with_it is not None
         fitted = with_it
-    pruned, _ = _prune(fitted, [(), ()], all_of_them=True)
-    assert [change.effect.name for change in pruned.model.changes] == ["clock", "damping"]
+    smaller, _ = pruned(fitted, ((), ()), all_of_them=True)
+    assert [placed.effect.name for placed in smaller.model.effects] == ["clock", "damping"]
 
 
 def test_the_truth_of_simulated_samples_is_not_looked_at_and_the_same_seed_gives_the_same_course():
@@ -310,7 +317,7 @@ def test_the_truth_of_simulated_samples_is_not_looked_at_and_the_same_seed_gives
     assert one.coefficients is None
 
 
-# Measured data ----------------------------------------------------------------------------------------------------------------
+# Measured data --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -323,15 +330,15 @@ def test_of_the_measured_gliders_the_offsets_and_the_unequal_masses_are_named():
     assert "unequal-masses" in present
     assert present[0] == "sensor-offset"
     assert {"damping", "quadratic-drag"} & {*present, *equal}
-    change = next(one for one in found.course.after.model.changes if one.effect.name == "unequal-masses")
-    scale = 1 + change.psi["scale"]
+    placed = next(one for one in found.course.after.model.effects if one.effect.name == "unequal-masses")
+    scale = 1 + placed.psi["scale"]
     assert max(scale, 1 / scale) == pytest.approx(2.48, rel=0.03)
     assert found.residual[0] > 5
     assert found.residual[1] < 2
     assert found.forecast[1] < 0.2 * found.forecast[0]
 
 
-# Small and ragged recordings -------------------------------------------------------------------------------------------------
+# Small and ragged recordings ------------------------------------------------------------------------------------------
 
 
 def waves(rows, sites, velocities, seed=0):
@@ -379,10 +386,18 @@ def test_what_does_not_move_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("terms", "missing"), [("u[n+1]+u[n-1]-2*u[n]", {"damping", "onsite-linear"}), ("u[n+1]+u[n-1]-2*u[n]; u[n]", set()), ("u[n]", None)]
+    ("terms", "missing"),
+    [
+        ("u[n+1]+u[n-1]-2*u[n]", {"damping", "onsite-linear"}),
+        ("u[n+1]+u[n-1]-2*u[n]; u[n]", set()),
+        ("u[n]", None),
+    ],
 )  # fmt: skip
 def test_a_real_chain_of_first_order_is_looked_at_as_any_other(terms, missing):
-    """A ladder of resistors and capacitors with a leak: u' = u_{n+1} + u_{n-1} - 2 u_n - 0.3 u_n, solved in closed form by its modes."""
+    """A ladder of resistors and capacitors with a leak, solved in closed form by its modes.
+
+    u' = u_{n+1} + u_{n-1} - 2 u_n - 0.3 u_n
+    """
     sites, t = 8, np.linspace(0, 4, 40)
     draw = np.random.default_rng(2)
     exchange = np.eye(sites, k=1) + np.eye(sites, k=-1) - 2 * np.eye(sites)

@@ -53,7 +53,7 @@ def test_a_trajectory_that_rests_does_not_spoil_the_share_of_the_others():
 def test_a_pulse_that_comes_after_the_readings_is_not_foreseen_and_spoils_no_forecast():
     data = swinging(lambda t: 0.01 * np.exp(-(((t - 17.0) / 0.4) ** 2) / 2))
     found = diagnose(OSCILLATOR, 2, [data], CATALOGUE)
-    assert "kick" in [change.effect.name for change in found.course.after.model.changes]
+    assert "kick" in [placed.effect.name for placed in found.course.after.model.effects]
     # The pulse itself is in the held-out part, and nobody could have known it.
     assert found.forecast[1] == pytest.approx(found.forecast[0], rel=0.2)
 
@@ -61,18 +61,18 @@ def test_a_pulse_that_comes_after_the_readings_is_not_foreseen_and_spoils_no_for
 def test_a_change_is_taken_out_with_its_own_coefficients():
     data = swinging(lambda t: 0.01 * np.exp(-(((t - 8.0) / 0.4) ** 2) / 2))
     whole = diagnose(OSCILLATOR, 2, [data], CATALOGUE).course.after
-    assert len(whole.model.changes) == 1
+    assert len(whole.model.effects) == 1
     less = without(whole, 0)
-    assert less.model.changes == ()
+    assert less.model.effects == ()
     np.testing.assert_array_equal(less.solution.state.coefficients, whole.solution.state.coefficients[:1])
 
 
 def test_the_past_of_an_instant_ago_is_no_memory():
     """A delay much shorter than the motion makes a sum of the field and its derivatives, which other effects are."""
+    from latticebench.diagnosis.catalogued import SHORTEST_DELAY, candidates_of
     from latticebench.diagnosis.tangent import linearise
-    from latticebench.diagnosis.ways import SHORTEST_DELAY, ways
     from latticebench.systems.effects import find
 
     fitted = first_fit(Model(OSCILLATOR, 2), [swinging()])
-    delays = [one.change.psi["delay"] for one in ways(linearise(fitted), find("memory"))]
+    delays = [one.placed.psi["delay"] for one in candidates_of(linearise(fitted), find("memory"))]
     assert min(delays) * OMEGA >= 0.95 * SHORTEST_DELAY

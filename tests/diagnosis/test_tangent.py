@@ -9,7 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import BSpline
 
-from latticebench.diagnosis.model import Change, Fitted, Force, Model
+from latticebench.diagnosis.model import Fitted, Model
+from latticebench.diagnosis.placed import Force, PlacedEffect
 from latticebench.diagnosis.tangent import by_psi, force_along, linearise, orthonormal
 from latticebench.methods.engine.shooting import Solution, State
 from latticebench.methods.engine.starts import guess
@@ -23,7 +24,9 @@ TIMES = np.linspace(0, 4, 21)
 SIGMA = 1e-4
 LIBRARIES = {
     "real": (2, library("real", ["u[n+1]+u[n-1]-2*u[n]", "u[n]", "u[n]**3"]), np.array([1.5, -1.0, -0.5])),
-    "complex": (1, library("complex", ["i*(u[n+1]+u[n-1]-2*u[n])", "i*abs(u[n])**2*u[n]", "u[n]"]), np.array([0.8, 1.0, -0.1])),
+    "complex": (
+        1, library("complex", ["i*(u[n+1]+u[n-1]-2*u[n])", "i*abs(u[n])**2*u[n]", "u[n]"]), np.array([0.8, 1.0, -0.1]),
+    ),
 }  # fmt: skip
 
 
@@ -59,7 +62,7 @@ def simulated(kind, ends, *, xi=None, force=None, scale=None, times=TIMES):
     return np.stack([y.real, y.imag], axis=1)[:, None]
 
 
-def fitted(kind, ends, changes=(), extra=(), **options):
+def fitted(kind, ends, effects=(), extra=(), **options):
     """A model as it is after a perfect fit: the coefficients known, the states those of the simulation."""
     order, declared, xi = LIBRARIES[kind]
     readings = simulated(kind, ends, **options)
@@ -69,13 +72,14 @@ def fitted(kind, ends, changes=(), extra=(), **options):
     else:
         samples = Samples(TIMES, readings[:, 0, 0] + 1j * readings[:, 0, 1], ends=ends)
         states = readings.reshape(len(TIMES), -1)
-    return perfect(Model(declared, order, tuple(changes)), samples, np.concatenate([xi, extra]), states)
+    return perfect(Model(declared, order, tuple(effects)), samples, np.concatenate([xi, extra]), states)
 
 
 def perfect(model, samples, xi, states, splines=None):
     levels = 1 if samples.v is None else 2
     solution = Solution(
-        State(xi, (states,), (splines,)), np.full(levels, SIGMA), np.eye(len(xi)), np.ones(levels), np.ones(levels), 1, True, ()
+        State(xi, (states,), (splines,)), np.full(levels, SIGMA), np.eye(len(xi)), np.ones(levels), np.ones(levels),
+        1, True, (),
     )  # fmt: skip
     return Fitted(model, (samples,), tuple(model.records([samples])), solution)
 
@@ -136,7 +140,7 @@ def test_a_reading_that_was_not_seen_has_no_row():
     np.testing.assert_allclose(some.answer(source)[:, 0], expected, rtol=1e-6, atol=1e-6 * np.max(abs(expected)))
 
 
-# Unknown ends ------------------------------------------------------------------------------------------------------------------
+# Unknown ends ---------------------------------------------------------------------------------------------------------
 
 WIDE = 11
 
@@ -178,10 +182,10 @@ def test_at_unknown_ends_what_the_start_and_the_outer_sites_splines_can_do_is_ta
     state = guess([samples], [record])
     splines, start = state.splines[0], state.nodes[0][0]
 
-    def moved(change, place=None, of_start=0.0):
+    def moved(placed, place=None, of_start=0.0):
         other = splines.copy()
         if place is not None:
-            other[place] += change
+            other[place] += placed
         return inner_motion(samples, record, other, start + of_start, border, xi)
 
     readings, nodes = moved(0.0)
@@ -200,7 +204,7 @@ def test_at_unknown_ends_what_the_start_and_the_outer_sites_splines_can_do_is_ta
     assert np.linalg.norm(path.free(noise)) / np.linalg.norm(noise) == pytest.approx(expected, abs=0.05)
 
 
-# Parameters that are not coefficients ----------------------------------------------------------------------------------------
+# Parameters that are not coefficients ---------------------------------------------------------------------------------
 
 
 def psi_column(model):
@@ -210,33 +214,33 @@ def psi_column(model):
 
 @pytest.mark.parametrize("ends", ["free", "periodic"])
 def test_the_column_of_a_drives_frequency_is_the_difference_of_two_simulations(ends):
-    change = Change(find("drive"), ("1",), {"omega": 1.7})
+    placed = PlacedEffect(find("drive"), ("1",), {"omega": 1.7})
 
     def force(omega):
         return lambda t: 0.3 * np.cos(omega * t) - 0.2 * np.sin(omega * t)
 
-    column = psi_column(fitted("real", ends, [change], [0.3, -0.2], force=force(1.7)))
+    column = psi_column(fitted("real", ends, [placed], [0.3, -0.2], force=force(1.7)))
     assert_same(column, slope(lambda e: simulated("real", ends, force=force(1.7 + e)), 1e-4))
 
 
 def test_the_column_of_a_complex_drives_frequency_is_the_difference_of_two_simulations():
-    change = Change(find("drive"), find("drive").texts(1, True), {"omega": 1.7})
+    placed = PlacedEffect(find("drive"), find("drive").texts(1, True), {"omega": 1.7})
 
     def force(omega):
         return lambda t: (0.3 + 0.1j) * np.cos(omega * t) + (-0.2 + 0.4j) * np.sin(omega * t)
 
     # The forces' order: text by text (1, i), and for each cos and sin.
-    model = fitted("complex", "free", [change], [0.3, -0.2, 0.1, 0.4], force=force(1.7))
+    model = fitted("complex", "free", [placed], [0.3, -0.2, 0.1, 0.4], force=force(1.7))
     assert_same(psi_column(model), slope(lambda e: simulated("complex", "free", force=force(1.7 + e)), 1e-4))
 
 
 def test_the_columns_of_a_pulses_time_and_width_are_the_differences_of_two_simulations():
-    change = Change(find("kick"), ("1",), {"at": 1.5, "width": 0.4})
+    placed = PlacedEffect(find("kick"), ("1",), {"at": 1.5, "width": 0.4})
 
     def force(at=1.5, width=0.4):
         return lambda t: 0.8 * np.exp(-(((t - at) / width) ** 2) / 2)
 
-    columns = psi_column(fitted("real", "free", [change], [0.8], force=force()))
+    columns = psi_column(fitted("real", "free", [placed], [0.8], force=force()))
     assert_same(columns[:, 0], slope(lambda e: simulated("real", "free", force=force(at=1.5 + e)), 1e-4), 1e-3)
     assert_same(columns[:, 1], slope(lambda e: simulated("real", "free", force=force(width=0.4 + e)), 1e-4), 1e-3)
 
@@ -245,26 +249,27 @@ def test_the_columns_of_a_pulses_time_and_width_are_the_differences_of_two_simul
 def test_the_column_of_a_delay_is_the_difference_of_two_simulations(kind):
     texts = find("memory").texts(*((1, True) if kind == "complex" else (2, False)))
 
-    # Any smooth field will do; where it jumps in slope, as at the start of a record, the integral of the force is less exact.
+    # Any smooth field will do; where it jumps in slope, as at the start of a record, the integral of the force is less
+    # exact.
     def past(t):
         return np.sin(np.multiply.outer(t, 1 + np.arange(SITES) / 4)) * (1 if kind == "real" else 1 + 0.5j)
 
-    change = Change(find("memory"), texts, {"delay": 0.63}, past=(past,))
+    placed = PlacedEffect(find("memory"), texts, {"delay": 0.63}, past=(past,))
     extra = [0.4, -0.3] if kind == "complex" else [0.4]
     amount = 0.4 - 0.3j if kind == "complex" else 0.4
 
     def force(delay):
         return lambda t: amount * past(t - delay)
 
-    model = fitted(kind, "free", [change], extra, force=force(0.63))
+    model = fitted(kind, "free", [placed], extra, force=force(0.63))
     assert_same(psi_column(model), slope(lambda e: simulated(kind, "free", force=force(0.63 + e)), 1e-3))
 
 
 @pytest.mark.parametrize(("kind", "ends"), CASES)
 def test_the_column_of_a_sites_mass_is_the_difference_of_two_simulations(kind, ends):
-    change = Change(find("unequal-masses"), (), {"scale": 0.4}, site=2)
+    placed = PlacedEffect(find("unequal-masses"), (), {"scale": 0.4}, site=2)
     unit = np.eye(SITES)[2]
-    column = psi_column(fitted(kind, ends, [change], scale=1 + 0.4 * unit))
+    column = psi_column(fitted(kind, ends, [placed], scale=1 + 0.4 * unit))
     assert_same(column, slope(lambda e: simulated(kind, ends, scale=1 + (0.4 + e) * unit), 1e-4))
 
 
@@ -274,7 +279,7 @@ def test_the_columns_of_the_instrument_are_the_differences_of_what_it_shows(kind
     at_three, parts = np.eye(SITES)[3], 1 + (kind == "complex")
 
     def column(name, psi, both=False):
-        return psi_column(fitted(kind, "free", [Change(find(name), psi=psi, both=both, site=3)]))
+        return psi_column(fitted(kind, "free", [PlacedEffect(find(name), psi=psi, both=both, site=3)]))
 
     def only_u(wrong):
         whole = np.zeros(field.shape)
@@ -300,26 +305,26 @@ def test_the_columns_of_the_instrument_are_the_differences_of_what_it_shows(kind
 
 @pytest.mark.parametrize("kind", LIBRARIES)
 def test_the_columns_of_the_clock_are_the_differences_of_what_is_read_at_other_times(kind):
-    rate = psi_column(fitted(kind, "free", [Change(find("clock"), psi={"rate": 0.0})]))
+    rate = psi_column(fitted(kind, "free", [PlacedEffect(find("clock"), psi={"rate": 0.0})]))
 
     def stretched(e):
         # A clock that is slow by e: the field is older than the time says. Both motions start at the same time.
         return simulated(kind, "free", times=TIMES * (1 + e))
 
     assert_same(rate, slope(stretched, 1e-5), 1e-5)
-    row = psi_column(fitted(kind, "free", [Change(find("clock"), psi={"row_6": 0.0})]))
+    row = psi_column(fitted(kind, "free", [PlacedEffect(find("clock"), psi={"row_6": 0.0})]))
     late = [simulated(kind, "free", times=np.array([0, TIMES[5] + e]))[1] for e in (1e-5, -1e-5)]
     expected = np.zeros((len(TIMES), *late[0].shape))
     expected[5] = (late[0] - late[1]) / 2e-5
     assert_same(row, expected, 1e-5)
 
 
-# What is projected out ---------------------------------------------------------------------------------------------------------
+# What is projected out ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", LIBRARIES)
 def test_the_projections_are_orthogonal(kind):
-    model = fitted(kind, "free", [Change(find("unequal-masses"), (), {"scale": 0.0}, site=2)])
+    model = fitted(kind, "free", [PlacedEffect(find("unequal-masses"), (), {"scale": 0.0}, site=2)])
     noisy = replace(
         model.records[0],
         value=model.records[0].value + SIGMA * np.random.default_rng(1).normal(size=model.records[0].value.shape),
@@ -362,7 +367,7 @@ def test_columns_that_are_the_same_to_rounding_count_once():
     assert orthonormal(np.zeros((30, 0))).shape == (30, 0)
 
 
-# Dry friction -----------------------------------------------------------------------------------------------------------------
+# Dry friction ---------------------------------------------------------------------------------------------------------
 
 
 def test_where_the_noise_hides_which_way_a_site_moves_friction_counts_by_its_mean():

@@ -10,12 +10,13 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from latticebench import systems
-from latticebench.bench.trials.specimen import make
+from latticebench.bench.trials.specimen import Conditions, make
 from latticebench.diagnosis import trace
+from latticebench.diagnosis.catalogued import candidates_of, frequencies, step_of
 from latticebench.diagnosis.model import Model, cut, first_fit
+from latticebench.diagnosis.placed import PlacedEffect
 from latticebench.diagnosis.tangent import linearise
-from latticebench.diagnosis.trace import Finding, rank, rarity, screen, tail
-from latticebench.diagnosis.ways import frequencies, step_of, ways
+from latticebench.diagnosis.trace import Screened, rank, rarity, screen, tail
 from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -26,12 +27,12 @@ SMALL = {"sites": 9, "samples": 30, "span": 6.0}
 def tangent_of(name, effect, z, seed, **options):
     """What the declared equation leaves of a specimen, and the specimen."""
     system = systems.find(name)
-    specimen = make(system, effect, z, np.random.default_rng(seed), **SMALL, **options)
+    specimen = make(system, effect, z, np.random.default_rng(seed), Conditions(**SMALL, **options))
     data = [replace(specimen.samples.observed(), ends=system.ends)]
     return linearise(first_fit(Model(system.library("equation"), system.order), data)), specimen
 
 
-# Chances -----------------------------------------------------------------------------------------------------------------------
+# Chances --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("columns", [1, 2, 3, 7, 20, 60])
@@ -75,14 +76,14 @@ def test_the_rarity_has_no_jump_and_never_falls():
 
 
 def test_a_search_costs_its_evidence_the_log_of_its_tries():
-    change = trace.Change(find("defect"), ("u[n]",), site=2)
-    one = Finding("defect", change, 30.0, 1, 1.0, 0.0)
-    many = Finding("defect", change, 30.0, 1, 9.0, float(np.log(9)))
+    placed = PlacedEffect(find("defect"), ("u[n]",), site=2)
+    one = Screened("defect", placed, 30.0, 1, 1.0, 0.0)
+    many = Screened("defect", placed, 30.0, 1, 9.0, float(np.log(9)))
     assert one.evidence - many.evidence == pytest.approx(np.log(9))
     assert many.p == pytest.approx(9 * one.p, rel=1e-3)
 
 
-# Noise alone ------------------------------------------------------------------------------------------------------------------
+# Noise alone ----------------------------------------------------------------------------------------------------------
 
 PLAIN = {
     "phi4": ["damping", "quadratic-drag", "drive", "defect", "kick", "unequal-masses", "memory", "sensor-offset"],
@@ -94,14 +95,14 @@ DRAWS = 150
 @pytest.mark.parametrize("name", PLAIN)
 def test_on_noise_alone_an_effect_is_as_rare_as_its_p_says(name):
     tangent, _ = tangent_of(name, "none", 0, 0)
-    groups = [(effect, True, ways(tangent, find(effect))) for effect in (*PLAIN[name], "disorder")]
+    groups = [(effect, True, candidates_of(tangent, find(effect))) for effect in (*PLAIN[name], "disorder")]
     assert all(tries for _, _, tries in groups)
     draw = np.random.default_rng(11)
     found = {effect: [] for effect, _, _ in groups}
     for _ in range(DRAWS):
         residual = trace.surrogate_residuals(tangent, draw, 1)[:, 0]
-        for finding in rank(replace(tangent, residual=residual), groups, draw, 60):
-            found[finding.name].append(finding.p)
+        for screened in rank(replace(tangent, residual=residual), groups, draw, 60):
+            found[screened.name].append(screened.p)
     for effect, chances in found.items():
         for level in (0.05, 0.1, 0.2):
             share, spread = np.mean(np.array(chances) < level), np.sqrt(level * (1 - level) / DRAWS)
@@ -116,23 +117,23 @@ def test_on_noise_alone_an_effect_is_as_rare_as_its_p_says(name):
 def test_an_effect_that_the_equation_has_already_is_not_tried():
     tangent, _ = tangent_of("phi4", "none", 0, 0)
     for name in ("onsite-linear", "onsite-cubic"):
-        assert ways(tangent, find(name)) == []
+        assert candidates_of(tangent, find(name)) == []
     names = [one.name for one in screen(tangent, CATALOGUE, np.random.default_rng(0), 20)]
     assert not {"onsite-linear", "onsite-cubic", "known-input", "nonlinear-loss"} & set(names)
     assert {"damping", "drive", "defect", "ends", "sensor-offset"} <= set(names)
 
 
 def test_noise_makes_no_effect_significant():
-    from latticebench.diagnosis.repair import significant
+    from latticebench.diagnosis.significance import beyond_chance
 
     for seed in range(3):
         tangent, _ = tangent_of("phi4", "none", 0, seed, variation=True)
-        assert significant(screen(tangent, CATALOGUE, np.random.default_rng(0), 60)) == ()
+        assert beyond_chance(screen(tangent, CATALOGUE, np.random.default_rng(0), 60)) == ()
 
 
 def test_pieces_of_a_record_are_searched_at_the_frequencies_of_the_whole():
     system = systems.find("phi4")
-    one = make(system, "none", 0.0, np.random.default_rng(1), sites=9, samples=60, span=12.0)
+    one = make(system, "none", 0.0, np.random.default_rng(1), Conditions(sites=9, samples=60, span=12.0))
     whole = [replace(one.samples.observed(), ends=system.ends)]
     model = Model(system.library("equation"), system.order)
     found = [frequencies(linearise(first_fit(model, cut(whole, length)))) for length in (60, 12)]
@@ -156,7 +157,7 @@ def test_a_strong_drive_is_among_the_frequencies_of_a_long_record_in_pieces():
     assert np.min(np.abs(found - 0.7)) < np.pi / 60
 
 
-# Places and frequencies -------------------------------------------------------------------------------------------------------
+# Places and frequencies -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["phi4", "dnls"])
@@ -167,7 +168,7 @@ def test_what_sits_at_one_site_is_found_at_that_site(name, effect):
         found = screen(tangent, [find("damping"), find("drive"), find(effect)], np.random.default_rng(0), 20)
         best = next(one for one in found if one.named)
         assert best.name == effect
-        assert best.change.site == specimen.about["site"]
+        assert best.placed.site == specimen.about["site"]
         assert best.p < 1e-6
 
 
@@ -180,7 +181,7 @@ def test_the_frequency_of_a_drive_is_found_within_a_resolution_element(name, eff
             one for one in screen(tangent, [find("damping"), find(effect)], np.random.default_rng(0), 20) if one.named
         )
         assert best.name == effect
-        assert abs(best.change.psi["omega"] - specimen.about["omega"]) < 2 * np.pi / SMALL["span"]
+        assert abs(best.placed.psi["omega"] - specimen.about["omega"]) < 2 * np.pi / SMALL["span"]
 
 
 def test_the_time_of_a_kick_is_found_within_its_width():
@@ -189,10 +190,10 @@ def test_the_time_of_a_kick_is_found_within_its_width():
         one for one in screen(tangent, [find("damping"), find("kick")], np.random.default_rng(0), 20) if one.named
     )
     assert best.name == "kick"
-    assert abs(best.change.psi["at"] - specimen.about["at"]) < max(specimen.about["width"], SMALL["span"] / 20)
+    assert abs(best.placed.psi["at"] - specimen.about["at"]) < max(specimen.about["width"], SMALL["span"] / 20)
 
 
-# Rounding ---------------------------------------------------------------------------------------------------------------------
+# Rounding -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -214,14 +215,14 @@ def test_readings_on_no_grid_have_no_step():
 
 
 def test_rounded_readings_are_named_and_finely_rounded_ones_are_not():
-    from latticebench.bench.trials.specimen import _rounded
+    from latticebench.bench.trials.specimen import rounded
 
     tangent, _ = tangent_of("phi4", "quantisation", 20, 0)
-    assert ways(tangent, find("quantisation"))
+    assert candidates_of(tangent, find("quantisation"))
     system = systems.find("phi4")
-    specimen = make(system, "none", 0, np.random.default_rng(0), **SMALL)
+    specimen = make(system, "none", 0, np.random.default_rng(0), Conditions(**SMALL))
     samples = replace(
-        specimen.samples.observed(), u=_rounded(specimen.samples.u, 0.1 * specimen.samples.sigma), ends=system.ends
+        specimen.samples.observed(), u=rounded(specimen.samples.u, 0.1 * specimen.samples.sigma), ends=system.ends
     )
     fine = linearise(first_fit(Model(system.library("equation"), 2), [samples]))
-    assert ways(fine, find("quantisation")) == []
+    assert candidates_of(fine, find("quantisation")) == []

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 
 from latticebench import systems
 from latticebench.bench.trials.faults import OTHERS
-from latticebench.bench.trials.specimen import make
-from latticebench.diagnosis import unnamed
+from latticebench.bench.trials.specimen import Conditions, make
+from latticebench.diagnosis import courses, modulated, smooth
 from latticebench.diagnosis.model import Model, first_fit
 from latticebench.diagnosis.repair import diagnose
 from latticebench.diagnosis.tangent import linearise
@@ -29,7 +29,7 @@ SMALL = {"sites": 9, "samples": 30, "span": 6.0}
 @functools.cache
 def tangent_of(name, effect="none", z=0.0):
     system = systems.find(name)
-    one = make(system, effect, z, np.random.default_rng(4), **SMALL, variation=True)
+    one = make(system, effect, z, np.random.default_rng(4), Conditions(**SMALL, variation=True))
     data = [replace(one.samples.observed(), ends=system.ends)]
     return linearise(first_fit(Model(system.library("equation"), system.order), data))
 
@@ -45,7 +45,7 @@ def left_by(columns, target):
 def test_a_smooth_force_that_depends_on_the_field_is_a_sum_of_the_polynomials(force):
     path = tangent_of("sine-gordon").paths[0]
     u, v = path.fields()
-    for make_them, x in ((unnamed._of_field, u), (unnamed._of_velocity, v)):
+    for make_them, x in ((smooth.of_field, u), (smooth.of_velocity, v)):
         assert left_by(make_them(path), force(x)[:, None]) < FAITHFUL
 
 
@@ -53,12 +53,12 @@ def test_a_complex_force_that_depends_on_the_size_of_the_field_is_one_too():
     path = tangent_of("dnls").paths[0]
     u = path.fields()[0]
     force = (0.3 - 1j) * u / (1 + np.abs(u) ** 2)
-    assert left_by(unnamed._of_field(path), np.stack([force.real, force.imag], axis=1)) < FAITHFUL
+    assert left_by(smooth.of_field(path), np.stack([force.real, force.imag], axis=1)) < FAITHFUL
 
 
 @pytest.mark.parametrize("name", ["phi4", "ginzburg-landau"])
 def test_what_a_spring_does_to_one_end_it_does_to_the_other_the_other_way_round(name):
-    pulls = unnamed._of_stretch(tangent_of(name).paths[0])
+    pulls = smooth.of_stretch(tangent_of(name).paths[0])
     np.testing.assert_allclose(np.sum(pulls, axis=-1), 0, atol=1e-10 * np.max(np.abs(pulls)))
 
 
@@ -67,7 +67,7 @@ def test_springs_of_any_law_are_sums_of_the_polynomials():
     u = path.fields()[0]
     right = np.concatenate([u[:, 1:], u[:, -1:]], axis=1) - u
     left = np.concatenate([u[:, :1], u[:, :-1]], axis=1) - u
-    assert left_by(unnamed._of_stretch(path), (np.tanh(2 * right) + np.tanh(2 * left))[:, None]) < FAITHFUL
+    assert left_by(smooth.of_stretch(path), (np.tanh(2 * right) + np.tanh(2 * left))[:, None]) < FAITHFUL
 
 
 def test_friction_in_springs_of_any_law_is_one_too():
@@ -75,14 +75,14 @@ def test_friction_in_springs_of_any_law_is_one_too():
     v = path.fields()[1]
     right = np.concatenate([v[:, 1:], v[:, -1:]], axis=1) - v
     left = np.concatenate([v[:, :1], v[:, :-1]], axis=1) - v
-    assert left_by(unnamed._of_stretch(path, "v"), (np.tanh(2 * right) + np.tanh(2 * left))[:, None]) < FAITHFUL
+    assert left_by(smooth.of_stretch(path, "v"), (np.tanh(2 * right) + np.tanh(2 * left))[:, None]) < FAITHFUL
 
 
 def test_a_stiffness_that_changes_in_time_is_a_sum_of_half_waves():
     path = tangent_of("sine-gordon").paths[0]
     u = path.fields()[0]
     x = (path.times - path.times[0]) / (path.times[-1] - path.times[0])
-    assert left_by(unnamed._in_time(path), ((x - 0.5)[:, None] * u)[:, None]) < FAITHFUL
+    assert left_by(modulated.in_time(path), ((x - 0.5)[:, None] * u)[:, None]) < FAITHFUL
 
 
 def test_a_coupling_that_changes_along_the_chain_is_a_sum_of_half_waves():
@@ -91,12 +91,12 @@ def test_a_coupling_that_changes_along_the_chain_is_a_sum_of_half_waves():
     right = np.concatenate([u[:, 1:], u[:, -1:]], axis=1) - u
     left = np.concatenate([u[:, :1], u[:, :-1]], axis=1) - u
     n = np.linspace(-1, 1, u.shape[1])
-    assert left_by(unnamed._along(path), (np.tanh(2 * n) * (right + left))[:, None]) < FAITHFUL
+    assert left_by(modulated.along_chain(path), (np.tanh(2 * n) * (right + left))[:, None]) < FAITHFUL
 
 
 def test_complex_terms_change_with_any_phase_and_none_counts_twice():
     path = tangent_of("ginzburg-landau").paths[0]
-    each = unnamed._steady(path)
+    each = modulated.steady_terms(path)
     assert len(each) == np.linalg.matrix_rank(each.reshape(len(each), -1)) == 6
 
 
@@ -125,7 +125,8 @@ def test_a_term_that_changes_in_time_and_along_the_chain_is_a_sum_of_products():
     u = path.fields()[0]
     x, n = np.linspace(0, 1, len(u))[:, None], np.linspace(-1, 1, u.shape[1])
     moving = np.exp(-((n - x) ** 2) / 2) * u
-    every = np.concatenate([unnamed._in_both(path), unnamed._in_time(path), unnamed._along(path), u[None, :, None]])
+    kinds = [modulated.in_both(path), modulated.in_time(path), modulated.along_chain(path)]
+    every = np.concatenate([*kinds, u[None, :, None]])
     assert left_by(every, moving[:, None]) < FAITHFUL
 
 
@@ -165,7 +166,9 @@ def test_what_has_no_form_is_found_by_what_it_depends_on(effect, name):
 def test_a_name_that_comes_near_is_not_given_where_a_term_without_one_does_better(name, effect):
     assert effect in OTHERS
     system = systems.find(name)
-    one = make(system, effect, 40.0, np.random.default_rng(1), sites=15, samples=40, span=8.0, variation=True)
+    one = make(
+        system, effect, 40.0, np.random.default_rng(1), Conditions(sites=15, samples=40, span=8.0, variation=True)
+    )
     found = diagnose(
         system.library("equation"), system.order, [replace(one.samples.observed(), ends=system.ends)], CATALOGUE
     )
@@ -176,7 +179,7 @@ def test_a_name_that_comes_near_is_not_given_where_a_term_without_one_does_bette
 def test_a_swing_is_a_sum_of_half_waves():
     x = np.linspace(0, 1, 333)
     halves = np.cos(np.pi * np.arange(16) * x[:, None])
-    for k, beat in zip(range(2, 15), unnamed.swings(16), strict=True):
+    for k, beat in zip(range(2, 15), courses.swings(16), strict=True):
         wanted = np.stack([np.cos(np.pi * k * x), np.sin(np.pi * k * x)], axis=1)
         assert np.sqrt(np.mean((halves @ beat - wanted) ** 2)) < 0.2
 
@@ -202,13 +205,13 @@ def test_a_term_that_is_another_at_one_site_is_found_there():
     found = diagnose(system.library("equation"), 2, data, CATALOGUE)
     assert found.course.verdict == "unexplained"
     first = found.course.left[0]
-    assert (first.name, first.change.site) == ("a term that is another at one site", 6)
+    assert (first.name, first.placed.site) == ("a term that is another at one site", 6)
 
 
 def test_a_drive_has_at_least_one_wave_in_the_record():
     """A slow drift is no oscillation, however well a piece of a long wave fits it."""
     system = systems.find("phi4")
-    one = make(system, "other: drifting-stiffness", 30.0, np.random.default_rng(3), **SMALL, variation=True)
+    one = make(system, "other: drifting-stiffness", 30.0, np.random.default_rng(3), Conditions(**SMALL, variation=True))
     found = diagnose(
         library("declared", [term.text for term in system.library("equation").terms]), 2,
         [replace(one.samples.observed(), ends=system.ends)], CATALOGUE,
@@ -216,5 +219,5 @@ def test_a_drive_has_at_least_one_wave_in_the_record():
     span = one.samples.t[-1] - one.samples.t[0]
     for turn in found.course.rounds:
         for entry in turn.ranking:
-            changes = entry.fitted.model.changes if entry.fitted is not None else ()
-            assert all(abs(change.psi.get("omega", np.inf)) > 0.999 * 2 * np.pi / span for change in changes)
+            effects = entry.fitted.model.effects if entry.fitted is not None else ()
+            assert all(abs(placed.psi.get("omega", np.inf)) > 0.999 * 2 * np.pi / span for placed in effects)

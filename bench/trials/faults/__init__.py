@@ -1,7 +1,8 @@
-"""What may be wrong with a chain or with the instrument: faults that recordings are made with, to see whether the loop finds them.
+"""Effects as they are put into simulated recordings, to see whether the diagnosis finds them.
 
-They are made apart from the loop: plain NumPy forces beside the system's own right-hand side, SciPy's integrators, and the instrument's
-faults put on afterwards. Five sets from outside the catalogue are blind: whoever made them had not looked at how the diagnosis works.
+A fault is the simulation of an effect, of the catalogue or from outside it. It shares no code with the diagnosis: plain
+NumPy forces beside the system's own right-hand side, SciPy's integrators, and what is wrong with the instrument put on
+afterwards. Five sets from outside the catalogue are blind: they were written without knowledge of the diagnosis.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ ROUNDED = "quantisation"
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """The simulation of one effect.
 
     Attributes:
-        fields: gives the clean readings with an amount of it.
-        only: where it makes sense: on lattices of second order, for complex fields, or everywhere.
-        real: its amount is a real number for complex fields, too.
-        sized: it has more or less of itself.
+        fields: from a setting and an amount to the clean readings.
+        only: where it makes sense: on lattices of second order, for complex fields, or everywhere (None).
+        real: whether its amount is a real number for complex fields, too.
+        sized: whether there can be more or less of it.
     """
 
     fields: Callable[[Setting, complex], Fields]
@@ -41,7 +42,7 @@ class Fault:
     sized: bool = True
 
     def fits(self, system: System) -> bool:
-        """Say whether a lattice can have it."""
+        """Return whether a system can have it."""
         if self.only is None:
             return True
         return system.is_complex if self.only == "complex" else system.order == 2
@@ -149,7 +150,7 @@ FAULTS = {**CATALOGUED, **OTHERS}
 
 
 def sensible(name: str, system: System) -> bool:
-    """Say whether a fault is one that this system's declared equation lacks and that makes sense for it."""
+    """Return whether an effect makes sense for a system, and its declared equation lacks it."""
     if name in OTHERS:
         return OTHERS[name].fits(system)
     effect = find(name)

@@ -1,7 +1,8 @@
-"""Faults of the instrument: the chain moves as declared, and the readings are wrong.
+"""Errors of the instrument: the chain moves as declared, and the readings are wrong.
 
-Each is given the size as a real number. A complex field's parts are read alike. Unless a fault says otherwise velocities are wrong as
-the field is; those that leave them alone have sensors of their own for them, which are sound.
+Each function returns the clean readings with an error of the given size, a real number. A complex field's parts are
+read alike. Velocities are wrong as the field is, unless a function says otherwise: they then have sensors of their own,
+which are sound.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ def offset(setting: Setting, size: float) -> Fields:
 
 def gain(setting: Setting, size: float) -> Fields:
     """Scale one site's readings."""
-    return _scaled(setting.run(), 1 + size * setting.one)
+    return _with_scale(setting.run(), 1 + size * setting.one)
 
 
 def curve(setting: Setting, size: float) -> Fields:
@@ -78,7 +79,7 @@ def slow(setting: Setting, size: float) -> Fields:
 
 
 def clipped(setting: Setting, size: float) -> Fields:
-    """Give all sensors of u one range, for each part of a complex field."""
+    """Clip all sensors of u to one range, for each part of a complex field."""
     u, v = setting.run()
     # The root, as what is lost grows faster than the range shrinks.
     limit = max(np.max(np.abs(u.real)), np.max(np.abs(u.imag))) / (1 + np.sqrt(size))
@@ -122,11 +123,11 @@ def slack(setting: Setting, size: float) -> Fields:
 
 def flickering(setting: Setting, size: float) -> Fields:
     """Light all sites with one lamp that flickers."""
-    return _scaled(setting.run(), (1 + size * setting.drawn.flicker)[:, None])
+    return _with_scale(setting.run(), (1 + size * setting.drawn.flicker)[:, None])
 
 
 def averaged(setting: Setting, size: float) -> Fields:
-    """Give means over a time that begins with each sample's, by Gauss's rule."""
+    """Read means over a time that begins with each sample's, by Gauss's rule."""
     # The root, as a mean over a time is off by its square but for a shift, which is as good as another start.
     over = float(np.sqrt(size))
     nodes, weights = np.polynomial.legendre.leggauss(AVERAGED)
@@ -145,9 +146,9 @@ def grounded(setting: Setting, size: float) -> Fields:
 
 
 def tilted(setting: Setting, size: float) -> Fields:
-    """Watch the chain with a camera that is not square to it: the scale grows from one end to the other by 2 size of its mean."""
+    """Watch the chain with a tilted camera: the scale grows from one end to the other by 2 size of its mean."""
     n = setting.drawn.n
-    return _scaled(setting.run(), 1 + size * n / np.max(n))
+    return _with_scale(setting.run(), 1 + size * n / np.max(n))
 
 
 def spiked(setting: Setting, size: float) -> Fields:
@@ -159,7 +160,8 @@ def spiked(setting: Setting, size: float) -> Fields:
 def blocked(setting: Setting, size: float) -> Fields:
     """Lead all sensors of u through capacitors, y' = u' - size y, which let what is constant fade.
 
-    They are uncharged at the start. Between the steps of a fine grid the field is taken as straight, for which this is exact.
+    They are uncharged at the start. Between the steps of a fine grid the field is taken as straight, for which this is
+    exact.
     """
     fine = setting.fine()
     u, v = fine.run()
@@ -171,16 +173,16 @@ def blocked(setting: Setting, size: float) -> Fields:
 
 
 def residue(setting: Setting, size: float) -> Fields:
-    """Scan all sites, row by row, with one converter that keeps a share of what it read before: y = (1 - size) u + size y_before.
+    """Scan all sites, row by row, with one converter that keeps a share of its last reading.
 
-    Before the first site of a row it has read the last one of the row before.
+    That is y = (1 - size) u + size y_before. Before the first site of a row it has read the last one of the row before.
     """
     u, v = setting.run()
     return _kept(u, size), None if v is None else _kept(v, size)
 
 
 def cyclic(setting: Setting, size: float) -> Fields:
-    """Read u with an interferometer or a grating, whose error repeats with its fringes: u + size sin(2 pi u / cycle)."""
+    """Read u with an interferometer, whose error repeats with its fringes: u + size sin(2 pi u / cycle)."""
     u, v = setting.run()
     turn = 2 * np.pi / float(setting.drawn.about["cycle"])
     if np.iscomplexobj(u):
@@ -189,7 +191,7 @@ def cyclic(setting: Setting, size: float) -> Fields:
 
 
 def exposed(setting: Setting, size: float) -> Fields:
-    """Let a camera for u set its own exposure, from the mean b of |u| in the row before: u (1 - size (b / b_first - 1))."""
+    """Let a camera for u expose by the mean b of |u| in the row before: u (1 - size (b / b_first - 1))."""
     u, v = setting.run()
     bright = np.mean(np.abs(u), axis=1)
     # The first row is exposed as it should be.
@@ -219,13 +221,13 @@ def two_cards(setting: Setting, size: float) -> Fields:
 
 
 def unbalanced(setting: Setting, size: float) -> Fields:
-    """Read a complex field with two mixers that are not alike in gain, so that its mirror image appears: u + size conj(u)."""
+    """Read a complex field with two mixers of unequal gain, so that its mirror image appears: u + size conj(u)."""
     u, v = setting.run()
     return u + size * np.conj(u), None if v is None else v + size * np.conj(v)
 
 
 def resampled(setting: Setting, size: float) -> Fields:
-    """Take rows in steps of a recorder's own, the root of size, and put the samples' times on straight lines between them."""
+    """Take rows in steps of the root of size, and read the samples off straight lines between them."""
     # The root, as straight lines miss a curve by the square of the step.
     step, times = float(np.sqrt(size)), setting.times
     place = (times - times[0]) / step
@@ -252,6 +254,6 @@ def _lowered(field: ndarray, size: float) -> ndarray:
     return np.asarray(field - size * np.mean(field, axis=1, keepdims=True))
 
 
-def _scaled(fields: Fields, factor: ndarray) -> Fields:
+def _with_scale(fields: Fields, factor: ndarray) -> Fields:
     u, v = fields
     return u * factor, None if v is None else v * factor

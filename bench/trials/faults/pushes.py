@@ -1,4 +1,4 @@
-"""Faults that push the sites: a force beside the chain's own, which follows from its state and the time."""
+"""Effects that push the sites: a force beside the chain's own, which follows from its state and the time."""
 
 from __future__ import annotations
 
@@ -34,61 +34,61 @@ class Moment:
     drawn: Drawn
 
     def neighbour(self, k: int) -> ndarray:
-        """Give the field k sites to the right, with what the ends repeat."""
+        """Return the field k sites to the right, with what the ends repeat."""
         u = self.u
         index, factor = ghosts(len(u), max(-k, 0), max(k, 0), self.chain.ends)
         begin = max(k, 0)
         return np.asarray((u[index] * factor)[begin : begin + len(u)])
 
     def stretch(self, k: int) -> ndarray:
-        """Give the difference to the field k sites to the right."""
+        """Return the difference to the field k sites to the right."""
         return np.asarray(self.neighbour(k) - self.u)
 
     def wave(self) -> float:
-        """Give the drive's harmonic."""
+        """Return the drive's harmonic."""
         about = self.drawn.about
         return float(np.cos(about["omega"] * self.t + about["phase"]))
 
     def sweep(self) -> float:
-        """Give the drive whose frequency rises all the time."""
+        """Return the drive whose frequency rises all the time."""
         about = self.drawn.about
         return float(np.cos((about["omega"] + about["sweep"] * self.t / 2) * self.t + about["phase"]))
 
     def waves(self, x: ndarray) -> ndarray:
-        """Give a drawn smooth function of a number at each site: three waves."""
+        """Return a drawn smooth function of a number at each site: three waves."""
         return np.asarray(np.sum(np.cos(self.drawn.shape[0] * x[:, None] + self.drawn.shape[1]), axis=1))
 
     def pulse(self) -> float:
-        """Give the bell-shaped pulse."""
+        """Return the bell-shaped pulse."""
         about = self.drawn.about
         return float(np.exp(-(((self.t - about["at"]) / about["width"]) ** 2) / 2))
 
     def spot(self) -> ndarray:
-        """Give the bell that moves along the chain, at each site."""
+        """Return the bell that moves along the chain, at each site."""
         about = self.drawn.about
         place = about["spot"] + about["speed"] * (self.t - about["middle"])
         return np.asarray(np.exp(-(((self.drawn.n - place) / about["breadth"]) ** 2) / 2))
 
     def travelling(self) -> ndarray:
-        """Give the travelling wave at each site."""
+        """Return the travelling wave at each site."""
         about = self.drawn.about
         angle = about["wave_number"] * self.drawn.n - about["omega"] * self.t + about["phase"]
         return np.asarray(np.exp(1j * angle) if self.chain.is_complex else np.cos(angle))
 
     def wire(self) -> ndarray:
-        """Give, at both ends of the wire, the difference to the field at its other end; 0 elsewhere."""
+        """Return, at both ends of the wire, the difference to the field at its other end; 0 elsewhere."""
         ends = [int(self.drawn.about["wire_from"]), int(self.drawn.about["wire_to"])]
         pull = np.zeros_like(self.u)
         pull[ends] = self.u[ends[::-1]] - self.u[ends]
         return pull
 
     def supply(self) -> float:
-        """Give how far the unsteady supply is from its mean."""
+        """Return how far the unsteady supply is from its mean."""
         omegas, phases = self.drawn.supply
         return float(np.sum(np.cos(omegas * self.t + phases)))
 
     def ticks(self) -> float:
-        """Give bells half as wide as the pulse, one of them where it is, that come again and again at equal times."""
+        """Return bells half as wide as the pulse, one of them where it is, that come again and again at equal times."""
         about = self.drawn.about
         late = (self.t - about["at"]) / about["ticking"]
         # The nearest one and those beside it: others are too far away to be felt.
@@ -96,29 +96,32 @@ class Moment:
         return float(np.sum(np.exp(-((2 * away / about["width"]) ** 2) / 2)))
 
     def two_level(self) -> float:
-        """Give +1 or -1, the state of something that switches to and fro at drawn times."""
+        """Return +1 or -1, the state of something that switches to and fro at drawn times."""
         return float((-1.0) ** np.sum(self.drawn.switches < self.t))
 
     def sponge(self) -> ndarray:
-        """Give how much of an absorber is at each site: 1 at both ends, less by exp(-distance / breadth) within."""
+        """Return how much of an absorber is at each site: 1 at both ends, less by exp(-distance / breadth) within."""
         n = np.abs(self.drawn.n)
         return np.asarray(np.exp((n - np.max(n)) / self.drawn.about["breadth"]))
 
 
 def between(m: Moment) -> ndarray:
-    """Give the velocities' second difference."""
+    """Return the velocities' second difference."""
     velocities = replace(m, u=m.v)
     return np.asarray(velocities.stretch(1) + velocities.stretch(-1))
 
 
 def steepening(m: Moment) -> ndarray:
-    """Give the slope of the field's cube, which moves high parts of a wave faster than low ones."""
+    """Return the slope of the field's cube, which moves high parts of a wave faster than low ones."""
     cubes = replace(m, u=np.abs(m.u) ** 2 * m.u)
     return np.asarray((cubes.neighbour(1) - cubes.neighbour(-1)) / 2)
 
 
 def gyroscopic(m: Moment) -> ndarray:
-    """Give half the difference of the neighbours' velocities, as spinning tops in the bonds or servos that act to one side make it."""
+    """Return half the difference of the neighbours' velocities.
+
+    Spinning tops in the bonds, or servos that act to one side, make such a force.
+    """
     velocities = replace(m, u=m.v)
     return np.asarray((velocities.neighbour(1) - velocities.neighbour(-1)) / 2)
 
@@ -151,7 +154,7 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "disorder": lambda m: m.drawn.each * m.u,
 }
 
-# Nothing of the catalogue; those called wavy and uneven have a form that is drawn, so that no list of terms can hold it.
+# Outside the catalogue; those called wavy and uneven have a form that is drawn, so that no list of terms can hold it.
 PLAIN: dict[str, Callable[[Moment], ndarray]] = {
     "other: cubic-drag": lambda m: -(m.v**3),
     "other: friction-between": between,
@@ -214,7 +217,7 @@ PUSHES = {**CATALOGUED, **PLAIN, **FIRST_BLIND, **SECOND_BLIND, **THIRD_BLIND, *
 
 
 def push(setting: Setting, amounts: dict[str, complex]) -> Push:
-    """Let several faults push at once, each with its amount."""
+    """Return the push of several effects at once, each with its amount."""
 
     def together(t: float, u: ndarray, v: ndarray) -> ndarray:
         moment = Moment(t, u, v, setting.chain, setting.drawn)

@@ -1,10 +1,10 @@
-"""What a fault is put into: a chain, its start and its times, with the places, frequencies and random numbers drawn for it."""
+"""What an effect is put into: a chain, its start and its times, and what is drawn for it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,10 +25,26 @@ FINE = 40
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """What is drawn for a recording, whether its fault needs it or not.
+    """What is drawn for a recording, whether its effect needs it or not.
+
+    Single numbers, all dimensionless:
+        site: (0, ..., N-1); middle: of the record.
+        omega, phase: frequency and phase of a drive; sweep: by how much its frequency rises per unit of time.
+        at, width: middle and width of a pulse; ticking: time between two ticks.
+        delay: of a memory.
+        s: power of a long-range coupling; fading: length of a nonlocal response.
+        wave_number: of a travelling force; spot, speed, breadth: place, speed and breadth of a moving one.
+        own: frequency of a resonator; sway: of a mount.
+        warming: time in which a sensor warms up; cooling: time in which heat goes.
+        wire_from, wire_to: sites at the ends of a wire.
+        grip: the most that a slipping spring is bent; play: how far a site goes before it meets a stop.
+        hum, hum_phase: frequency and phase of the mains.
+        relaxing: time in which a stretched bond gives way.
+        cycle: distance after which a sensor's error repeats itself.
+        aside: number of sites by which something is moved along the chain.
 
     Attributes:
-        about: single numbers by their names (`draw_all`).
+        about: those numbers by their names.
         n: place of each site, counted from the chain's middle (N,).
         far: long-range coupling of the sites (N, N).
         bond: one bond's force (N, N).
@@ -80,8 +96,8 @@ class Setting:
         chain: its own motion.
         start: its state at the first time.
         times: of the samples (T,).
-        drawn: what was drawn for the fault.
-        standing: what pushes the chain besides the fault, if anything does.
+        drawn: what was drawn for the effect.
+        standing: what pushes the chain besides the effect, if anything does.
     """
 
     chain: Motion
@@ -96,7 +112,7 @@ class Setting:
         return np.asarray(np.eye(self.chain.sites)[self.drawn.site])
 
     def run(self, push: Push | None = None) -> Fields:
-        """Integrate the chain with a push, which is given t, u and v (u for order 1).
+        """Return u and v of the chain with a push, a function of t, u and v (u for order 1).
 
         Raises:
             InputError: the motion is unbounded.
@@ -115,36 +131,36 @@ class Setting:
         return chain.unpack(integrated(forced, self.start, self.times))
 
     def parts(self, force: ndarray) -> ndarray:
-        """Write a force as a state's rates have it: the real parts, then the imaginary ones."""
+        """Return a force as a state's rates have it: the real parts, then the imaginary ones."""
         return np.concatenate([force.real, force.imag]) if self.chain.is_complex else force
 
     def at(self, times: ndarray) -> Setting:
-        """Give the same with other times."""
+        """Return the same with other times."""
         return replace(self, times=times)
 
     def fine(self) -> Setting:
-        """Give the same with FINE - 1 more times between each two."""
+        """Return the same with FINE - 1 more times between each two."""
         rows = np.arange(len(self.times))
         return self.at(np.interp(np.arange(FINE * (len(rows) - 1) + 1) / FINE, rows, self.times))
 
     def other_ends(self) -> Setting:
-        """Give the same with the ends that the chain does not have."""
+        """Return the same with the ends that the chain does not have."""
         return replace(self, chain=replace(self.chain, ends=other(self.chain.ends)))
 
     def own_rate(self, t: float, u: ndarray, v: ndarray) -> ndarray:
-        """Give the chain's own right-hand side (N,)."""
+        """Return the chain's own right-hand side (N,)."""
         chain = self.chain
         own = chain.right_hand_side(t, chain.pack(u, v))[-chain.parts * chain.sites :]
         return np.asarray(own[: chain.sites] + 1j * own[chain.sites :] if chain.is_complex else own)
 
 
 def other(ends: Ends) -> Ends:
-    """Give the ends that a chain has instead of its own."""
+    """Return the ends that a chain has instead of its own."""
     return "fixed" if ends == "free" else "free"
 
 
 def integrated(rate: Callable[[float, ndarray], ndarray], start: ndarray, times: ndarray) -> ndarray:
-    """Integrate real equations: (states, T).
+    """Return the solution of real equations (states, T).
 
     Raises:
         InputError: the motion is unbounded.
@@ -160,18 +176,25 @@ def integrated(rate: Callable[[float, ndarray], ndarray], start: ndarray, times:
     return np.asarray(found.y)
 
 
-def draw_all(name: str, sites: int, times: ndarray, draw: np.random.Generator) -> Drawn:
-    """Draw places, times and frequencies for a fault.
+def draw_circumstances(name: str, sites: int, times: ndarray, draw: np.random.Generator) -> Drawn:
+    """Draw the places, times, frequencies and random numbers of a recording.
 
-    Single numbers are the `site` (0, ..., N-1), frequency `omega` and `phase` of a drive, middle `at` and `width` of a pulse, `delay`, power
-    `s` of a long-range coupling, and the `middle` of the record; `wave_number` of a travelling force, `spot`, `speed` and `breadth` of a
-    moving one, frequency `own` of a resonator, `warming`, a sensor's time; `wire_from` and `wire_to`, the sites at the ends of a wire,
-    `grip`, the most that a slipping spring is bent, `cooling`, the time in which heat goes, `fading` length of a response, `hum` and
-    `hum_phase`, frequency and phase of the mains; `play`, how far a site goes before it meets a stop, `sway`, frequency of a mount; `sweep`,
-    by how much a drive's frequency rises in a unit of time; `ticking`, the time between two ticks, `relaxing`, the time in which a stretched
-    bond gives way, `cycle`, the way after which a sensor's error repeats itself, `aside`, by how many sites something is moved
-    along the chain. All are dimensionless.
+    Args:
+        name: of its effect, or of several with a + between them.
+        sites: N.
+        times: of the samples (T,).
+        draw: for all of them.
     """
+    about, first = _first_numbers(name, sites, times, draw)
+    # From a generator of their own, so that they change nothing of what is drawn after them.
+    more = np.random.default_rng(first["shape"].view(np.uint64).ravel().tolist())
+    return Drawn(about, **first, **_more_numbers(about, sites, times, more))
+
+
+def _first_numbers(
+    name: str, sites: int, times: ndarray, draw: np.random.Generator
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """Return the single numbers and the arrays, by their names, that are drawn first."""
     span = float(times[-1] - times[0])
     n = np.arange(sites) - (sites - 1) / 2
     power = draw.uniform(1.5, 3.0)
@@ -203,8 +226,15 @@ def draw_all(name: str, sites: int, times: ndarray, draw: np.random.Generator) -
     bonds = np.diag(strengths, 1) + np.diag(strengths, -1)
     bonds -= np.diag(bonds.sum(axis=1))
     shape = np.stack([draw.uniform(1.0, 5.0, size=3), draw.uniform(0, 2 * np.pi, size=3)])
-    # From a generator of their own, so that nothing else changes what it draws; what a new fault needs is drawn last.
-    more = np.random.default_rng(shape.view(np.uint64).ravel().tolist())
+    return about, {
+        "n": n, "far": far - np.diag(far.sum(axis=1)), "bond": bond, "bonds": bonds, "shape": shape, "each": each,
+        "omegas": omegas, "phases": phases, "late": late, "force": force,
+    }  # fmt: skip
+
+
+def _more_numbers(about: dict[str, float], sites: int, times: ndarray, more: np.random.Generator) -> dict[str, Any]:
+    """Add further single numbers to `about`, and return further arrays; what a new effect needs is drawn last."""
+    span = float(times[-1] - times[0])
     about |= {
         "wave_number": more.choice([-1.0, 1.0]) * more.uniform(0.6, 2.4),
         "spot": sites * more.uniform(-0.15, 0.15),
@@ -220,6 +250,7 @@ def draw_all(name: str, sites: int, times: ndarray, draw: np.random.Generator) -
         "hum": more.uniform(3.0, 9.0),
         "hum_phase": more.uniform(0, 2 * np.pi),
     }
+    distance = np.abs(np.subtract.outer(np.arange(sites), np.arange(sites)))
     near = np.exp(-distance / about["fading"])
     pickup = more.uniform(0.5, 1.5, size=sites)
     about |= {"play": more.uniform(0.3, 0.7), "sway": more.uniform(1.0, 4.0)}
@@ -238,7 +269,7 @@ def draw_all(name: str, sites: int, times: ndarray, draw: np.random.Generator) -
     }
     switches = float(times[0]) + span * np.sort(more.uniform(0.05, 0.95, size=6))
     wander = np.append(0.0, np.cumsum(more.normal(size=len(times) - 1))) / np.sqrt(len(times))
-    return Drawn(
-        about, n, far - np.diag(far.sum(axis=1)), bond, bonds, shape, each, omegas, phases, late, force, near, pickup,
-        supply, flicker, spikes, switches, wander,
-    )  # fmt: skip
+    return {
+        "near": near, "pickup": pickup, "supply": supply, "flicker": flicker, "spikes": spikes, "switches": switches,
+        "wander": wander,
+    }  # fmt: skip

@@ -1,4 +1,7 @@
-"""Faults that act through what is not in the chain's present state: its past, something hidden, a measured input, other inertia."""
+"""Effects that act through what the chain's present state lacks: its past, something hidden, an input, other inertia.
+
+Each function returns the clean readings of a chain with an amount of the effect.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +76,7 @@ def unequal_masses(setting: Setting, amount: complex) -> Fields:
 
 
 def shared_inertia(setting: Setting, amount: complex) -> Fields:
-    """Give bonds a mass: u'' = F becomes u'' - amount (u''_{n+1} + u''_{n-1} - 2 u''_n) = F; with u' for order 1."""
+    """Return bonds a mass: u'' = F becomes u'' - amount (u''_{n+1} + u''_{n-1} - 2 u''_n) = F; with u' for order 1."""
     chain, drawn = setting.chain, setting.drawn
     own = np.eye(chain.sites)
     differences = np.stack([between(Moment(0.0, one, one, chain, drawn)) for one in own], axis=1)
@@ -93,9 +96,9 @@ def end_stops(setting: Setting, amount: complex) -> Fields:
 
 
 def viscoelastic_bonds(setting: Setting, amount: complex) -> Fields:
-    """Couple neighbours by rubber, too, that gives way: amount times the second difference of u - w, where w' = (u - w) / relaxing.
+    """Couple neighbours by rubber, too, that gives way: amount times the second difference of u - w.
 
-    It is relaxed at the start.
+    Here w' = (u - w) / relaxing; the rubber is relaxed at the start.
     """
     chain, drawn, relaxing = setting.chain, setting.drawn, float(setting.drawn.about["relaxing"])
 
@@ -108,7 +111,7 @@ def viscoelastic_bonds(setting: Setting, amount: complex) -> Fields:
 
 
 def fatiguing_bonds(setting: Setting, amount: complex) -> Fields:
-    """Let each bond weaken by amount d, where d' is the square of its stretch: what it has borne so far, and it does not recover."""
+    """Let each bond weaken for good by amount d, where d' is the square of its stretch."""
 
     def both(_t: float, borne: ndarray, u: ndarray, _v: ndarray) -> tuple[ndarray, ndarray]:
         stretch = np.diff(u)
@@ -119,7 +122,7 @@ def fatiguing_bonds(setting: Setting, amount: complex) -> Fields:
 
 
 def holding_loop(setting: Setting, amount: complex) -> Fields:
-    """Let a servo hold the mean m of all sites where it was: it pushes all alike by -amount times the integral of m(t) - m(0)."""
+    """Let a servo hold the mean m of all sites: it pushes each by -amount times the integral of m(t) - m(0)."""
     held = np.mean(setting.chain.unpack(setting.start)[0])
 
     def both(_t: float, summed: ndarray, u: ndarray, _v: ndarray) -> tuple[ndarray, ndarray]:
@@ -129,9 +132,10 @@ def holding_loop(setting: Setting, amount: complex) -> Fields:
 
 
 def parallel_chain(setting: Setting, amount: complex) -> Fields:
-    """Let a second chain like this one lie beside it, out of sight: sites w opposite each other pull by amount (w - u), amount (u - w).
+    """Let a second chain like this one lie beside it, out of sight.
 
-    It starts as this one does, moved along by a few sites.
+    A site u and the site w opposite pull at each other by amount (w - u). The second chain starts as the first does,
+    moved along by a few sites.
     """
     chain = setting.chain
     rate, size = chain.right_hand_side, chain.parts * chain.sites
@@ -147,7 +151,10 @@ def parallel_chain(setting: Setting, amount: complex) -> Fields:
 
 
 def bent_wire(setting: Setting, amount: complex) -> Fields:
-    """Thread each site like a bead on a bent wire, so that its inertia grows away from 0: (1 + amount u^2) u'' + amount u u'^2 = F."""
+    """Thread each site like a bead on a bent wire: (1 + amount u^2) u'' + amount u u'^2 = F.
+
+    Its inertia grows away from 0.
+    """
     bent = float(np.real(amount))
 
     def push(t: float, u: ndarray, v: ndarray) -> ndarray:
@@ -158,14 +165,21 @@ def bent_wire(setting: Setting, amount: complex) -> Fields:
 
 
 def ends(setting: Setting, _amount: complex) -> Fields:
-    """Give the chain the ends that it is not declared to have."""
+    """Return the chain the ends that it is not declared to have."""
     return setting.other_ends().run()
 
 
 def _with_resonators(setting: Setting, amount: complex, hung: ndarray, own: float) -> Fields:
-    """Integrate with unseen things, each hung on some sites (things, N), 1 for each of them, which it pulls by amount (w - m).
+    """Return the readings with unseen things, each of which pulls some sites by amount (w - m).
 
-    m is their mean. Its own motion is w'' = own^2 (m - w), or w' = own (m - w), times i for a complex field; it starts as they do.
+    Here w is its own place, and m the mean of its sites. Its motion is w'' = own^2 (m - w), or w' = own (m - w), times
+    i for a complex field; it starts as they do.
+
+    Args:
+        setting: the chain.
+        amount: strength of the pull.
+        hung: 1 at the sites of each thing, 0 elsewhere (things, N).
+        own: frequency of the things.
     """
     chain = setting.chain
     rate, size = chain.right_hand_side, chain.parts * chain.sites
@@ -190,7 +204,7 @@ def _with_resonators(setting: Setting, amount: complex, hung: ndarray, own: floa
 def _with_hidden(
     setting: Setting, push: Callable[[ndarray, ndarray], ndarray], change: Callable[[ndarray, ndarray], ndarray]
 ) -> Fields:
-    """Integrate with something unseen at each site, a number h that starts at 0.
+    """Return the readings with something unseen at each site, a number h that starts at 0.
 
     The push is given h and u; the rate at which h changes follows from h and v (u for order 1).
     """
@@ -204,7 +218,7 @@ def _with_hidden(
 def _with_unseen(
     setting: Setting, begin: ndarray, both: Callable[[float, ndarray, ndarray, ndarray], tuple[ndarray, ndarray]]
 ) -> Fields:
-    """Integrate with unseen numbers h, real ones or complex ones as they are at the start.
+    """Return the readings with unseen numbers h, real ones or complex ones as they are at the start.
 
     The push of the sites, and the rates at which these numbers change, follow from t, h, u and v (u for order 1).
     """
@@ -222,7 +236,9 @@ def _with_unseen(
 
 
 def _with_past(setting: Setting, late: Callable[[ndarray, ndarray], ndarray]) -> Fields:
-    """Integrate in steps of one delay: within one, the past is known. Before the start the field was what it was then.
+    """Return the readings of a chain with a memory, integrated in steps of one delay: within one, the past is known.
+
+    Before the start the field was what it was then.
 
     The push is given the field as it was and as it is.
     """

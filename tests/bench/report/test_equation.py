@@ -12,7 +12,8 @@ import pytest
 
 from latticebench.bench.report import mathematics
 from latticebench.bench.report.equation import Equation, equation
-from latticebench.diagnosis.model import Change, Model
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.placed import PlacedEffect
 from latticebench.systems.effects import CATALOGUE, Effect, find
 from latticebench.systems.lattice import library
 
@@ -24,7 +25,7 @@ PSI: dict[str, dict[str, float]] = {
 }  # fmt: skip
 
 
-def changes(effect: Effect, order: int, is_complex: bool) -> list[Change]:
+def changes(effect: Effect, order: int, is_complex: bool) -> list[PlacedEffect]:
     """The effect as it is put into a model; a sensor's offset also as what it does to the equation."""
     texts = effect.texts(order, is_complex)
     if not texts:
@@ -33,14 +34,14 @@ def changes(effect: Effect, order: int, is_complex: bool) -> list[Change]:
     site = 2 if effect.acts in ("one site", "one equation", "gain") else None
     past = (lambda t: np.zeros((len(t), 2 if is_complex else 1, SITES)),)
     ends = "fixed" if effect.acts == "ends" else None
-    change = Change(effect, texts, psi, site, ends, past)
+    change = PlacedEffect(effect, texts, psi, site, ends, past)
     if effect.acts != "offset":
         return [change]
     each = {f"real_{k + 1}": 0.1 * k for k in range(SITES)}
-    return [Change(effect, texts, {"real_3": 0.1}, 2), Change(effect, texts, each, as_force=True)]
+    return [PlacedEffect(effect, texts, {"real_3": 0.1}, 2), PlacedEffect(effect, texts, each, as_force=True)]
 
 
-def shown(declared: str, added: list[Change], order: int, is_complex: bool) -> Equation:
+def shown(declared: str, added: list[PlacedEffect], order: int, is_complex: bool) -> Equation:
     """The equation of a model with coefficients of all sizes."""
     model = Model(library("own", declared), order, tuple(added))
     data = [SimpleNamespace(sites=SITES, is_complex=is_complex)]
@@ -52,7 +53,7 @@ def shown(declared: str, added: list[Change], order: int, is_complex: bool) -> E
     return equation(fitted)
 
 
-def check(found: Equation, added: list[Change]) -> None:
+def check(found: Equation, added: list[PlacedEffect]) -> None:
     """Every form is whole: brackets close, the MathML is sound, and each effect is somewhere."""
     assert found.latex.count("{") == found.latex.count("}")
     assert found.latex.count(r"\left") == found.latex.count(r"\right")

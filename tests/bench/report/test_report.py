@@ -26,7 +26,7 @@ from latticebench.bench.report.page import page, write_page
 from latticebench.bench.report.separation import separation
 from latticebench.bench.report.text import show
 from latticebench.bench.report.whereabouts import scaled_residuals, spectrum, whereabouts
-from latticebench.bench.trials.specimen import make
+from latticebench.bench.trials.specimen import Conditions, make
 from latticebench.diagnosis.repair import Diagnosis, diagnose
 from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.errors import InputError
@@ -40,10 +40,10 @@ BROWSER = next(
 
 def diagnosed(system: str, effect: str, z: float) -> Diagnosis:
     studied = systems.find(system)
-    specimen = make(studied, effect, z, np.random.default_rng(3), sites=9, samples=40)
+    specimen = make(studied, effect, z, np.random.default_rng(3), Conditions(sites=9, samples=40))
     declared = studied.library("equation")
     data = [replace(specimen.samples, ends=studied.ends)]
-    return diagnose(declared, studied.order, data, CATALOGUE, truth=studied.truth(declared, {}))
+    return diagnose(declared, studied.order, data, CATALOGUE).against(studied.truth(declared, {}))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def pendulum() -> Diagnosis:
 @pytest.fixture(scope="module")
 def rough() -> Diagnosis:
     """Two recordings, one of uneven times, both with gaps; a sensor that never answered."""
-    specimen = make(systems.find("phi4"), "damping", 40, np.random.default_rng(3), sites=9, samples=40)
+    specimen = make(systems.find("phi4"), "damping", 40, np.random.default_rng(3), Conditions(sites=9, samples=40))
     draw = np.random.default_rng(1)
     data = []
     for kept in (np.arange(40), np.sort(draw.choice(40, 33, replace=False))):
@@ -121,7 +121,7 @@ def test_the_noise_of_a_complex_field_is_that_of_both_parts_together(driven: Dia
     sigma = driven.course.after.data[0]
     assert sigma.is_complex
     studied = systems.find("dnls")
-    specimen = make(studied, "drive", 30, np.random.default_rng(3), sites=9, samples=40)
+    specimen = make(studied, "drive", 30, np.random.default_rng(3), Conditions(sites=9, samples=40))
     assert content(driven).noise == pytest.approx(specimen.samples.sigma, rel=0.1)
 
 
@@ -271,7 +271,7 @@ def test_the_page_shows_all_figures_and_equations_in_a_browser(
 ) -> None:
     diagnosis: Diagnosis = request.getfixturevalue(which)
     found = measured(page_of(diagnosis), tmp_path / "page.html", extra=("--window-size=1000,900",))
-    cured = bool(diagnosis.course.after.model.changes)
+    cured = bool(diagnosis.course.after.model.effects)
     assert len(found["figures"]) == (5 if cured else 4)  # type: ignore[arg-type]
     for width, height in found["figures"]:  # type: ignore[attr-defined]
         assert width > 200

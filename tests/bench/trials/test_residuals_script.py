@@ -21,7 +21,7 @@ def residuals(script: Callable[[str], ModuleType]) -> ModuleType:
 @pytest.mark.parametrize("name", ["trajectory", "weak", "splines"])
 def test_every_residual_names_a_force_that_is_plain_to_see(residuals: ModuleType, name: str) -> None:
     system = systems.find("phi4")
-    one = specimen.make(system, "damping", 100.0, np.random.default_rng(3), variation=True)
+    one = specimen.make(system, "damping", 100.0, np.random.default_rng(3), specimen.Conditions(variation=True))
     samples = replace(one.samples.observed(), ends=system.ends)
     tangent = residuals.METHODS[name](Model(system.library("equation"), system.order), samples)
     # The declared terms have been projected out.
@@ -31,7 +31,7 @@ def test_every_residual_names_a_force_that_is_plain_to_see(residuals: ModuleType
 
 def test_weak_rows_are_white_where_nothing_is_missing(residuals: ModuleType) -> None:
     system = systems.find("phi4")
-    one = specimen.make(system, "none", 0.0, np.random.default_rng(3), variation=True)
+    one = specimen.make(system, "none", 0.0, np.random.default_rng(3), specimen.Conditions(variation=True))
     samples = replace(one.samples.observed(), ends=system.ends)
     tangent = residuals.by_weak(Model(system.library("equation"), system.order), samples)
     assert np.sum(tangent.residual**2) / tangent.spare == pytest.approx(1, abs=0.2)

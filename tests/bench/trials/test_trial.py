@@ -17,7 +17,7 @@ from latticebench.bench.store import create, open_store
 from latticebench.bench.suite import Suite, load
 from latticebench.bench.trials import scores
 from latticebench.bench.trials.faults import SECOND_BLIND
-from latticebench.bench.trials.specimen import make
+from latticebench.bench.trials.specimen import Conditions, make
 from latticebench.bench.trials.trial import Trial, is_right
 from latticebench.bench.worker import attempt
 from latticebench.systems.effects import CATALOGUE
@@ -193,7 +193,7 @@ def test_where_the_right_effect_is_named_forecasts_are_those_of_the_true_model(e
 def test_the_true_model_of_a_long_range_coupling_reaches_as_far_as_the_way_it_was_found_in():
     """What is drawn for other faults must not change an effect's own parameters."""
     drawn = make(
-        systems.find("phi4"), "long-range", 10.0, np.random.default_rng(1), sites=9, samples=30, span=6.0
+        systems.find("phi4"), "long-range", 10.0, np.random.default_rng(1), Conditions(sites=9, samples=30, span=6.0)
     ).about
     own = {"reach", "open", "scale", "step", "width", "at", "omega", "delay", "s"}
     assert own & set(drawn) == {"at", "width", "omega", "delay", "s"}

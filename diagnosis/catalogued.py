@@ -1,17 +1,18 @@
-"""The ways in which each effect of the catalogue might be there: at which site, frequency, time or delay, and what it would add."""
+"""The candidates of each effect of the catalogue: where, at which frequency, time or delay it may act."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from latticebench.diagnosis.model import Change, far_matrix, pace
+from latticebench.diagnosis.candidate import Candidate, as_candidate, places, too_wide
+from latticebench.diagnosis.model import pace
+from latticebench.diagnosis.placed import PlacedEffect, far_matrix
 from latticebench.diagnosis.residual import of_dynamics
-from latticebench.diagnosis.tangent import Path, Tangent, force_along, forces, orthonormal
+from latticebench.diagnosis.tangent import Path, Tangent, force_along, own_forces
 from latticebench.systems.effects import Effect
 from latticebench.systems.errors import InputError
 from latticebench.systems.stencil import Ends
@@ -32,52 +33,23 @@ DELAYS = 10
 SHORTEST_DELAY = 0.5
 POWERS = tuple(np.arange(0.5, 5.1, 0.25))
 FARTHEST, FARTHEST_OPEN = 8, 24
-# Rounding that makes this share of the noise's variance is named; that readings lie on a grid is no accident, whatever the residual.
+# Rounding that makes this share of the noise's variance is named: that readings lie on a grid is no accident, whatever
+# the residual.
 ROUNDED = 1 / 3
 
 
-@dataclass(frozen=True, eq=False)
-class Try:
-    """One way in which an effect might be there.
-
-    Attributes:
-        change: the effect with its place and parameters.
-        basis: orthonormal columns of what it could add (rows, q).
-        spread: for a random effect, the variance of each column for a unit variance of its coefficients (q,); else None.
-    """
-
-    change: Change
-    basis: Float[ndarray, "rows q"]
-    spread: Float[ndarray, " q"] | None = None
-
-
-def ways(tangent: Tangent, effect: Effect) -> list[Try]:
-    """List the ways in which an effect might be there."""
-    make: dict[str, Callable[[Tangent, Effect], list[Try | None]]] = {
-        "harmonic": _harmonic, "pulse": _pulse, "delayed": _late, "long range": _far, "one site": _sited, "every site": _disordered,
-        "one equation": _scaled, "ends": _ended, "offset": _misread, "gain": _misread, "curve": _misread, "clock": _clock,
-        "rounding": _rounded,
+def candidates_of(tangent: Tangent, effect: Effect) -> list[Candidate]:
+    """Return the candidates of an effect."""
+    make: dict[str, Callable[[Tangent, Effect], list[Candidate | None]]] = {
+        "harmonic": _harmonic, "pulse": _pulse, "delayed": _remembered, "long range": _far, "one site": _sited,
+        "every site": _disordered, "one equation": _unequal, "ends": _ended, "offset": _instrumental,
+        "gain": _instrumental, "curve": _instrumental, "clock": _clock, "rounding": _quantised,
     }  # fmt: skip
     return [one for one in make.get(effect.acts, _everywhere)(tangent, effect) if one is not None]
 
 
-def attempt(tangent: Tangent, change: Change, columns: ndarray, random: bool = False) -> Try | None:
-    """Make a try of columns that may be within what the model can do; None where they could explain nearly any residual."""
-    left = tangent.new(columns)
-    if random:
-        basis, values, _ = np.linalg.svd(left, full_matrices=False)
-        kept = values > 1e-6 * max(values[0], 1e-300) if len(values) else np.zeros(0, dtype=bool)
-        return (
-            Try(change, basis[:, kept], values[kept] ** 2)
-            if 1 < np.sum(kept) <= tangent.spare / 2 and values[0] > 0
-            else None
-        )
-    basis = orthonormal(left)
-    return Try(change, basis) if 0 < basis.shape[1] <= tangent.spare / 4 else None
-
-
-def _texts(tangent: Tangent, effect: Effect) -> tuple[str, ...]:
-    """Give the effect's terms on this lattice, as far as they can be evaluated."""
+def _terms_of(tangent: Tangent, effect: Effect) -> tuple[str, ...]:
+    """Return the effect's terms on this lattice, as far as they can be evaluated."""
     samples = tangent.fitted.data[0]
     dynamics = tangent.paths[0].record.stretches.dynamics
     texts = effect.texts(dynamics.order, samples.is_complex)
@@ -90,30 +62,25 @@ def _texts(tangent: Tangent, effect: Effect) -> tuple[str, ...]:
     return texts
 
 
-def too_wide(term: Term, dynamics: Any) -> bool:
-    """Say whether a term reaches beyond what the chain shows."""
-    left, right = term.reach
-    if dynamics.ends == "unknown":
-        return bool(left > dynamics.reach[0] or right > dynamics.reach[1])
-    return bool(max(left, right) >= dynamics.sites) and dynamics.ends != "fixed"
-
-
-def _forced(tangent: Tangent, change: Change) -> ndarray:
-    """Give the columns of a change's forces."""
+def _force_columns(tangent: Tangent, placed: PlacedEffect) -> ndarray:
+    """Return the columns of an effect's forces."""
     dynamics = tangent.paths[0].record.stretches.dynamics
     return tangent.columns(
-        lambda k, path: path.answer(force_along(path, change.forces(dynamics.sites, dynamics.is_complex, k)))
+        lambda k, path: path.answer(force_along(path, placed.forces(dynamics.sites, dynamics.is_complex, k)))
     )
 
 
-def _everywhere(tangent: Tangent, effect: Effect) -> list[Try | None]:
-    texts = _texts(tangent, effect)
-    change = Change(effect, texts)
-    return [attempt(tangent, change, _forced(tangent, change))] if texts else []
+def _everywhere(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
+    texts = _terms_of(tangent, effect)
+    placed = PlacedEffect(effect, texts)
+    return [as_candidate(tangent, placed, _force_columns(tangent, placed))] if texts else []
 
 
 def frequencies(tangent: Tangent) -> ndarray:
-    """Give the angular frequencies that a drive is searched at: of pieces of a record, those that the whole record tells apart."""
+    """Return the angular frequencies that a drive is searched at.
+
+    For pieces of a record these are the frequencies that the whole record tells apart.
+    """
     times = np.unique(np.concatenate([path.record.times for path in tangent.paths]))
     span = float(times[-1] - times[0])
     highest = np.pi / float(np.median([step for path in tangent.paths for step in np.diff(path.record.times)]))
@@ -136,11 +103,11 @@ def frequencies(tangent: Tangent) -> ndarray:
 
 
 def _records(tangent: Tangent) -> list[tuple[Float[ndarray, " time"], list[Float[ndarray, "time parts"]]]]:
-    """Give times of each record, and what may show the line of a drive there, averaged over the sites.
+    """Return the times of each record, and the series that may show the line of a drive there, averaged over the sites.
 
-    That is what is left of the readings; and, as that of pieces has the lines of how they were cut, too, what the model's terms with any
-    coefficients leave of the highest derivative, by itself (a drive) and times the field (a parametric one). Pieces that follow each
-    other in time are of one record.
+    These are what is left of the readings and, since that of pieces has the lines of how they were cut, too, what the
+    model's terms with any coefficients leave of the highest derivative: by itself (a drive) and times the field (a
+    parametric one). Pieces that follow each other in time are of one record.
     """
     records: list[list[int]] = []
     paths = tangent.paths
@@ -162,7 +129,7 @@ def _records(tangent: Tangent) -> list[tuple[Float[ndarray, " time"], list[Float
             found.append((times, [readings]))
             continue
         whole = np.concatenate([np.nan_to_num(smoothed[k].left) for k in numbers])
-        terms = np.concatenate([forces(paths[k])[:, :: paths[k].steps] for k in numbers], axis=1).reshape(
+        terms = np.concatenate([own_forces(paths[k])[:, :: paths[k].steps] for k in numbers], axis=1).reshape(
             -1, whole.size
         )
         missing = (whole.ravel() - terms.T @ np.linalg.lstsq(terms.T, whole.ravel(), rcond=None)[0]).reshape(
@@ -179,73 +146,75 @@ def _records(tangent: Tangent) -> list[tuple[Float[ndarray, " time"], list[Float
     return found
 
 
-def _harmonic(tangent: Tangent, effect: Effect) -> list[Try | None]:
-    texts = _texts(tangent, effect)
+def _harmonic(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
+    texts = _terms_of(tangent, effect)
     if not texts:
         return []
     omegas = frequencies(tangent)
-    changes = [Change(effect, texts, {"omega": float(omega)}) for omega in omegas]
-    return _together(tangent, changes)
+    effects = [PlacedEffect(effect, texts, {"omega": float(omega)}) for omega in omegas]
+    return _in_one_go(tangent, effects)
 
 
-def _pulse(tangent: Tangent, effect: Effect) -> list[Try | None]:
-    texts = _texts(tangent, effect)
+def _pulse(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
+    texts = _terms_of(tangent, effect)
     if not texts:
         return []
-    changes = []
+    effects = []
     for path in tangent.paths:
         times = path.record.times
         span = float(times[-1] - times[0])
         for width in WIDTHS:
             size = max(width * span, float(np.median(np.diff(times))))
-            changes += [
-                Change(effect, texts, {"at": float(at), "width": size})
+            effects += [
+                PlacedEffect(effect, texts, {"at": float(at), "width": size})
                 for at in np.linspace(times[0] + span / PULSES / 2, times[-1] - span / PULSES / 2, PULSES)
             ]
-    return _together(tangent, changes)
+    return _in_one_go(tangent, effects)
 
 
-def _together(tangent: Tangent, changes: Sequence[Change]) -> list[Try | None]:
-    """Try changes of equally many forces; their columns are computed in one go."""
-    if not changes:
+def _in_one_go(tangent: Tangent, effects: Sequence[PlacedEffect]) -> list[Candidate | None]:
+    """Return candidates of equally many forces each; their columns are computed in one go."""
+    if not effects:
         return []
     dynamics = tangent.paths[0].record.stretches.dynamics
 
     def columns(number: int, path: Path) -> ndarray:
-        every = [force for change in changes for force in change.forces(dynamics.sites, dynamics.is_complex, number)]
+        every = [force for placed in effects for force in placed.forces(dynamics.sites, dynamics.is_complex, number)]
         return path.answer(force_along(path, every))
 
     found = tangent.columns(columns)
-    each = found.shape[1] // len(changes)
-    return [attempt(tangent, change, found[:, k * each : (k + 1) * each]) for k, change in enumerate(changes)]
+    each = found.shape[1] // len(effects)
+    return [as_candidate(tangent, placed, found[:, k * each : (k + 1) * each]) for k, placed in enumerate(effects)]
 
 
-def _late(tangent: Tangent, effect: Effect) -> list[Try | None]:
-    texts = _texts(tangent, effect)
+def _remembered(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
+    texts = _terms_of(tangent, effect)
     if not texts:
         return []
-    past = _histories(tangent)
-    return _together(tangent, [Change(effect, texts, {"delay": float(delay)}, past=past) for delay in lags(tangent)])
+    past = _past_fields(tangent)
+    return _in_one_go(
+        tangent, [PlacedEffect(effect, texts, {"delay": float(delay)}, past=past) for delay in lags(tangent)]
+    )
 
 
 def lags(tangent: Tangent) -> list[float]:
-    """Give the delays that a memory is searched at; none where the record is too short for any."""
+    """Return the delays that a memory is searched at; none where the record is too short for any."""
     times = tangent.paths[0].record.times
     span, step = float(times[-1] - times[0]), float(np.median(np.diff(times)))
     shortest = max(1.5 * step, SHORTEST_DELAY / max(pace((path.times, path.field) for path in tangent.paths), 1e-300))
     return [] if shortest >= span / 3 else [float(delay) for delay in np.geomspace(shortest, span / 3, DELAYS)]
 
 
-def _histories(tangent: Tangent) -> tuple[Callable[[ndarray], ndarray], ...]:
-    """Give the fitted field of each trajectory at any time; before the record it is what it was at its beginning."""
+def _past_fields(tangent: Tangent) -> tuple[Callable[[ndarray], ndarray], ...]:
+    """Return the fitted field of each trajectory at any time; before the record it is what it was at its beginning."""
     paths = tangent.paths
     if len(paths) > 1 and all(a.times[-1] < b.times[0] for a, b in itertools.pairwise(paths)):
         # Pieces of one record know each other's past.
-        return (_history(paths),) * len(paths)
-    return tuple(_history([path]) for path in paths)
+        return (_past_field(paths),) * len(paths)
+    return tuple(_past_field([path]) for path in paths)
 
 
-def _history(paths: Sequence[Path]) -> Callable[[ndarray], ndarray]:
+def _past_field(paths: Sequence[Path]) -> Callable[[ndarray], ndarray]:
     from scipy.interpolate import CubicSpline
 
     times = np.concatenate([path.times for path in paths])
@@ -253,74 +222,69 @@ def _history(paths: Sequence[Path]) -> Callable[[ndarray], ndarray]:
     return lambda t: np.asarray(curve(np.clip(t, times[0], times[-1])))
 
 
-def _far(tangent: Tangent, effect: Effect) -> list[Try | None]:
-    texts = _texts(tangent, effect)
+def _far(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
+    texts = _terms_of(tangent, effect)
     dynamics = tangent.paths[0].record.stretches.dynamics
     sites = dynamics.sites
     if not texts or dynamics.ends == "unknown" or sites < 4:
         return []
     # With the couplings that the ends repeat, and between the sites that there are; on a ring both are the same.
     repeated = [
-        Change(effect, texts, {"s": float(s), "reach": float(min(FARTHEST, sites - 1)), "open": 0.0}) for s in POWERS
-    ]
-    between = [
-        Change(effect, texts, {"s": float(s), "reach": float(min(FARTHEST_OPEN, sites - 1)), "open": 1.0})
+        PlacedEffect(effect, texts, {"s": float(s), "reach": float(min(FARTHEST, sites - 1)), "open": 0.0})
         for s in POWERS
     ]
-    found: list[Try | None] = []
+    between = [
+        PlacedEffect(effect, texts, {"s": float(s), "reach": float(min(FARTHEST_OPEN, sites - 1)), "open": 1.0})
+        for s in POWERS
+    ]
+    found: list[Candidate | None] = []
     for kind in (repeated, between) if dynamics.ends in ("free", "fixed") else (repeated,):
         farthest = int(kind[0].psi["reach"])
         pulls = [Term(f"u[n+{r}]+u[n-{r}]-2*u[n]") for r in range(2, farthest + 1)]
 
-        def columns(_number: int, path: Path, kind: list[Change] = kind, pulls: list[Term] = pulls) -> ndarray:
+        def columns(_number: int, path: Path, kind: list[PlacedEffect] = kind, pulls: list[Term] = pulls) -> ndarray:
             if kind[0].psi["open"]:
                 fields = path.field[:, 0]
-                sources = [fields @ far_matrix(change.psi, sites).T for change in kind]
+                sources = [fields @ far_matrix(placed.psi, sites).T for placed in kind]
             else:
                 each = path.sources(pulls)
                 far = np.arange(2, len(pulls) + 2)
-                sources = [np.tensordot(far ** -change.psi["s"], each, (0, 0)) for change in kind]
+                sources = [np.tensordot(far ** -placed.psi["s"], each, (0, 0)) for placed in kind]
             if len(texts) > 1:
                 sources = [part for one in sources for part in (one, np.stack([-one[:, 1], one[:, 0]], axis=1))]
             return path.answer(np.stack(sources))
 
         every = tangent.columns(columns)
         each = len(texts)
-        found += [attempt(tangent, change, every[:, k * each : (k + 1) * each]) for k, change in enumerate(kind)]
+        found += [as_candidate(tangent, placed, every[:, k * each : (k + 1) * each]) for k, placed in enumerate(kind)]
     return found
 
 
-def places(tangent: Tangent) -> list[int]:
-    """List the sites that have an equation."""
-    dynamics = tangent.paths[0].record.stretches.dynamics
-    return list(range(*dynamics.moving.indices(dynamics.sites)))
-
-
-def _sited(tangent: Tangent, effect: Effect) -> list[Try | None]:
-    texts = _texts(tangent, effect)
+def _sited(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
+    texts = _terms_of(tangent, effect)
     sites = places(tangent)
     if not texts or len(sites) < 2:
         return []
-    return _together(tangent, [Change(effect, texts, site=site) for site in sites])
+    return _in_one_go(tangent, [PlacedEffect(effect, texts, site=site) for site in sites])
 
 
-def _disordered(tangent: Tangent, effect: Effect) -> list[Try | None]:
-    texts = _texts(tangent, effect)
+def _disordered(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
+    texts = _terms_of(tangent, effect)
     if not texts or len(places(tangent)) < 3:
         return []
     model, is_complex = tangent.fitted.model, tangent.paths[0].is_complex
     present = [
         *model.declared.terms,
-        *(Term(text) for one in model.changes if one.effect.acts == "everywhere" for text in one.texts),
+        *(Term(text) for one in model.effects if one.effect.acts == "everywhere" for text in one.texts),
     ]
     # Where the model has the term, or a part of it, its mean is known by another name.
     whole = all(express(Term(text), present, is_complex) is None for text in texts)
-    change = Change(effect, texts, {"whole": True} if whole else {})
-    columns = _forced(tangent, change)
-    return [attempt(tangent, change, columns[:, np.linalg.norm(columns, axis=0) > 0], random=True)]
+    placed = PlacedEffect(effect, texts, {"whole": True} if whole else {})
+    columns = _force_columns(tangent, placed)
+    return [as_candidate(tangent, placed, columns[:, np.linalg.norm(columns, axis=0) > 0], random=True)]
 
 
-def _scaled(tangent: Tangent, effect: Effect) -> list[Try | None]:
+def _unequal(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
     sites = places(tangent)
     if len(sites) < 2:
         return []
@@ -328,23 +292,24 @@ def _scaled(tangent: Tangent, effect: Effect) -> list[Try | None]:
 
     def columns(_number: int, path: Path) -> ndarray:
         dynamics = path.record.stretches.dynamics
-        total = np.tensordot(coefficients, forces(path), (0, 0))
+        total = np.tensordot(coefficients, own_forces(path), (0, 0))
         masks = np.eye(dynamics.sites)[sites][:, dynamics.moving]
         return path.answer(total[None] * masks[:, None, None])
 
     found = tangent.columns(columns)
     return [
-        attempt(tangent, Change(effect, (), {"scale": 0.0}, site=site), found[:, [k]]) for k, site in enumerate(sites)
+        as_candidate(tangent, PlacedEffect(effect, (), {"scale": 0.0}, site=site), found[:, [k]])
+        for k, site in enumerate(sites)
     ]
 
 
-def _ended(tangent: Tangent, effect: Effect) -> list[Try | None]:
+def _ended(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
     fitted = tangent.fitted
     declared = tangent.paths[0].record.stretches.dynamics.ends
     if declared == "unknown":
         return []
     coefficients = fitted.solution.state.coefficients
-    found: list[Try | None] = []
+    found: list[Candidate | None] = []
     for ends in get_args(Ends):
         if ends in ("unknown", declared):
             continue
@@ -356,40 +321,40 @@ def _ended(tangent: Tangent, effect: Effect) -> list[Try | None]:
                 other = other * dynamics.weights[:, None, None, dynamics.moving]
             return path.answer(np.tensordot(coefficients, other, (0, 0))[None])
 
-        found.append(attempt(tangent, Change(effect, ends=ends), tangent.columns(column)))
+        found.append(as_candidate(tangent, PlacedEffect(effect, ends=ends), tangent.columns(column)))
     return found
 
 
-def _misread(tangent: Tangent, effect: Effect) -> list[Try | None]:
+def _instrumental(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
     fitted = tangent.fitted
     dynamics = tangent.paths[0].record.stretches.dynamics
     sites, seen = dynamics.sites, tangent.paths[0].weight.shape[1]
     if not effect.texts(dynamics.order, dynamics.is_complex):
         return []
-    present = {name for change in fitted.model.changes if change.effect.name == effect.name for name in change.psi}
+    present = {name for placed in fitted.model.effects if placed.effect.name == effect.name for name in placed.psi}
     kinds = ["real", "imaginary"] if effect.acts == "offset" and dynamics.is_complex else ["real"]
     every = [f"{kind}_{k + 1}" for kind in kinds for k in range(sites)]
-    changes, random = [], []
+    effects, random = [], []
     for both in (False, True) if seen > 1 and effect.acts != "offset" else (False,):
         if effect.acts == "curve":
-            changes.append(Change(effect, psi={"real": 0.0}, both=both))
+            effects.append(PlacedEffect(effect, psi={"real": 0.0}, both=both))
             continue
         for k in range(sites):
             names = [f"{kind}_{k + 1}" for kind in kinds]
             if not present & set(names):
-                changes.append(Change(effect, psi=dict.fromkeys(names, 0.0), both=both, site=k))
+                effects.append(PlacedEffect(effect, psi=dict.fromkeys(names, 0.0), both=both, site=k))
         if sites > 1 and not present:
-            random.append(Change(effect, psi=dict.fromkeys(every, 0.0), both=both))
-    found = [attempt(tangent, change, _readings(tangent, change)) for change in changes]
+            random.append(PlacedEffect(effect, psi=dict.fromkeys(every, 0.0), both=both))
+    found = [as_candidate(tangent, placed, _readings(tangent, placed)) for placed in effects]
     if effect.acts == "offset" and dynamics.order == 2 and not present and not dynamics.is_complex:
-        forced = Change(effect, psi=dict.fromkeys(every, 0.0), as_force=True)
-        columns = _forced(tangent, forced)
-        found.append(attempt(tangent, forced, columns[:, np.linalg.norm(columns, axis=0) > 0], random=sites > 2))
-    return found + [attempt(tangent, change, _readings(tangent, change), random=True) for change in random]
+        forced = PlacedEffect(effect, psi=dict.fromkeys(every, 0.0), as_force=True)
+        columns = _force_columns(tangent, forced)
+        found.append(as_candidate(tangent, forced, columns[:, np.linalg.norm(columns, axis=0) > 0], random=sites > 2))
+    return found + [as_candidate(tangent, placed, _readings(tangent, placed), random=True) for placed in random]
 
 
-def _readings(tangent: Tangent, change: Change) -> ndarray:
-    """Give the columns of an instrument's effect."""
+def _readings(tangent: Tangent, placed: PlacedEffect) -> ndarray:
+    """Return the columns of an instrument's effect."""
     from latticebench.diagnosis.model import rates
 
     state = tangent.fitted.solution.state
@@ -398,24 +363,24 @@ def _readings(tangent: Tangent, change: Change) -> ndarray:
         levels = path.weight.shape[1]
         field = path.field[:: path.steps][:, :levels]
         rate = rates(path.record, state, number)[:, :levels]
-        return path.rows(np.stack([change.misreading_by(name, path.record.times, field, rate) for name in change.psi]))
+        return path.rows(np.stack([placed.misreading_by(name, path.record.times, field, rate) for name in placed.psi]))
 
     return tangent.columns(columns)
 
 
-def _clock(tangent: Tangent, effect: Effect) -> list[Try | None]:
-    change = Change(effect, psi={"rate": 0.0})
-    found = [attempt(tangent, change, _readings(tangent, change))]
+def _clock(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
+    placed = PlacedEffect(effect, psi={"rate": 0.0})
+    found = [as_candidate(tangent, placed, _readings(tangent, placed))]
     rows = len(tangent.paths[0].record.times)
     numbers = np.sum(tangent.paths[0].weight > 0) / rows
     if len(tangent.paths) == 1 and rows <= LONG and numbers >= 3:
-        jitter = Change(effect, psi={f"row_{k + 1}": 0.0 for k in range(rows)})
-        found.append(attempt(tangent, jitter, _readings(tangent, jitter), random=True))
+        jitter = PlacedEffect(effect, psi={f"row_{k + 1}": 0.0 for k in range(rows)})
+        found.append(as_candidate(tangent, jitter, _readings(tangent, jitter), random=True))
     return found
 
 
 def step_of(values: Float[ndarray, " values"]) -> float:
-    """Find the step that all readings are multiples of, up to a common offset; 0 where there is none."""
+    """Return the step that all readings are multiples of, up to a common offset; 0 where there is none."""
     seen = np.unique(values[np.isfinite(values)])
     if len(seen) < 3:
         return 0.0
@@ -430,8 +395,8 @@ def step_of(values: Float[ndarray, " values"]) -> float:
     return step if np.max(np.abs(gaps / step - np.round(gaps / step))) < 1e-3 else 0.0
 
 
-def _rounded(tangent: Tangent, effect: Effect) -> list[Try | None]:
-    """Try rounding: a rounded reading tells where in its step the field is, by what rounding leaves on average."""
+def _quantised(tangent: Tangent, effect: Effect) -> list[Candidate | None]:
+    """Return the candidate of rounding: what rounding leaves on average tells where in its step the field is."""
     steps = []
     for path in tangent.paths:
         value = path.record.value[:, 0][path.record.seen[:, 0]]
@@ -445,10 +410,10 @@ def _rounded(tangent: Tangent, effect: Effect) -> list[Try | None]:
 
     first = tangent.paths[0].record
     origin = float(first.value[:, 0][first.seen[:, 0]][0])
-    change = Change(effect, psi={"step": step, "inner": float(inner), "origin": origin})
+    placed = PlacedEffect(effect, psi={"step": step, "inner": float(inner), "origin": origin})
 
     def column(_number: int, path: Path) -> ndarray:
         field = path.field[:: path.steps][:, : path.weight.shape[1]]
-        return path.rows(change.misreading(path.record.times, field, field)[None])
+        return path.rows(placed.misreading(path.record.times, field, field)[None])
 
-    return [attempt(tangent, change, tangent.columns(column))]
+    return [as_candidate(tangent, placed, tangent.columns(column))]
