@@ -31,7 +31,7 @@ import numpy as np
 from latticebench.methods.engine.networks.arrays import Arrays, host, one_thread
 from latticebench.methods.engine.networks.history import HistoryLog
 from latticebench.methods.engine.networks.members import best_member, member_draws, spread
-from latticebench.methods.engine.networks.projection import Curve, CurveSettings, Step, project, step
+from latticebench.methods.engine.networks.projection import Curve, CurveSettings, ProjectedStep, project, projected_step
 from latticebench.methods.engine.networks.sizes import estimate_sizes
 from latticebench.methods.method import Abilities, Fit, History, Smooth
 from latticebench.systems.errors import InputError
@@ -177,7 +177,7 @@ class PINNVP:
 
     def _descend(
         self, curves: list[Curve], at: list[Array], xi: Array, weight: float, going: Array, log: HistoryLog
-    ) -> tuple[list[Array], Array, Step]:
+    ) -> tuple[list[Array], Array, ProjectedStep]:
         """Take Levenberg-Marquardt steps with one weight.
 
         Each member has its own damping: one whose trial fails tries again while the others move on.
@@ -205,7 +205,7 @@ class PINNVP:
         least = arrays.zeros(*xi.shape[:-1]) + 1e-12
         damping, steps, active = least, arrays.zeros(*xi.shape[:-1]), going
         while bool(active.any()):
-            trial = step(curves, at, xi, weight, damping, hat=False)
+            trial = projected_step(curves, at, xi, weight, damping, hat=False)
             lower = objective(trial.weights, trial.coefficients)
             found = active & trial.sound & (lower < value)
             at = [xp.where(found[..., None, None], new, old) for new, old in zip(trial.weights, at, strict=True)]
@@ -217,12 +217,12 @@ class PINNVP:
             active = active & xp.where(found, (steps < self.iterations) & ~enough, damping < 1e3)
             if bool(found.any()):
                 log.note(len(log.step) + 1, host(value), host(xi))
-        last = step(curves, at, xi, weight, least, hat=True)
+        last = projected_step(curves, at, xi, weight, least, hat=True)
         for _ in range(2):
             if bool((last.sound | ~going).all()):
                 break
             least = xp.where(last.sound, least, least * 100)
-            last = step(curves, at, xi, weight, least, hat=True)
+            last = projected_step(curves, at, xi, weight, least, hat=True)
         return at, xi, last
 
 

@@ -166,11 +166,11 @@ def test_torch_is_not_imported_with_the_module():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_one_network_on_the_processor_has_the_numbers_that_it_had_before_there_were_members():
+def test_one_network_on_the_processor_keeps_its_numbers():
     samples, _ = oscillators()
-    # Written down with the code as it was; few steps, so that round-off has not grown.
-    before = {0: [-1.36435710869814, -0.3619149282486815], 1: [-2.383709343616671, 0.6031578967491639]}
-    for seed, coefficients in before.items():
+    # Few steps, so that round-off has not grown.
+    kept = {0: [-1.36435710869814, -0.3619149282486815], 1: [-2.383709343616671, 0.6031578967491639]}
+    for seed, coefficients in kept.items():
         method = PINN(**FEW, adam_steps=40, lbfgs_steps=20)
         fit = solve(method, [samples], library("lib", "u[n]; u[n]**3"), 2, seed)
         np.testing.assert_allclose(fit.coefficients, coefficients, rtol=1e-6)

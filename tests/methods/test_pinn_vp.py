@@ -121,10 +121,9 @@ def gappy(samples: Samples) -> Samples:
     return Samples(samples.t, u)
 
 
-def test_one_network_on_the_processor_has_the_numbers_that_it_had_before_there_were_devices():
+def test_one_network_on_the_processor_keeps_its_numbers():
     samples, _ = oscillators()
-    # Written down with the code as it was.
-    before = [
+    kept = [
         (gappy(samples), [-2.0081096628073265, 0.00325133699155257], [0.18382252093121895, 0.1096253522903831]),
         (
             noisy(samples, 0.02, 1),
@@ -132,7 +131,7 @@ def test_one_network_on_the_processor_has_the_numbers_that_it_had_before_there_w
             [0.06417826153721297, 0.03833170782768845],
         ),
     ]
-    for data, coefficients, stderr in before:
+    for data, coefficients, stderr in kept:
         fit = solve(PINNVP(**SMALL), [data], library("lib", "u[n]; u[n]**3"), 2, 0)
         np.testing.assert_allclose(fit.coefficients, coefficients, rtol=1e-6, atol=1e-7)
         assert fit.stderr is not None

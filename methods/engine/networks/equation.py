@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Equation:
+class CurveEquation:
     """rate = sum_j xi_j T_j on one trajectory, at P times.
 
     Attributes:
@@ -123,9 +123,9 @@ class Equation:
         return (self.parts if slot.name == "v" else 0) + (slot.part == "im")
 
 
-def equation(
+def curve_equation(
     samples: Samples, library: Library, order: int, times: Float[ndarray, " time"], arrays: Arrays
-) -> Equation:
+) -> CurveEquation:
     """Set a library up on one trajectory.
 
     Args:
@@ -156,7 +156,7 @@ def equation(
             assert forced is not None
             first = reach[0] + slot.offset
             given[slot] = move(forced[:, first : first + shape[1]])
-    return Equation(
+    return CurveEquation(
         compiled, len(library.terms), 1 + samples.is_complex, order, sites, reach, inner,
         None if fold is None else move(fold), given,
     )  # fmt: skip

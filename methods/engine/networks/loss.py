@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.methods.engine.networks.equation import Equation, columns, equation, multipliers
+from latticebench.methods.engine.networks.equation import CurveEquation, columns, curve_equation, multipliers
 from latticebench.methods.engine.networks.network import (
     backward,
     forward,
@@ -71,7 +71,7 @@ class SampleSet:
         share: the weight of each value in the mean over the samples (T, outputs); 0 where it was not observed.
     """
 
-    equation: Equation
+    equation: CurveEquation
     data: Array
     share: Array
 
@@ -138,7 +138,7 @@ class NetworkLoss:
                 for k in range(0, self.outputs, level)
             ]
             scaled = arrays.move(np.where(seen, target, 0.0) / units)
-            law = equation(one, library, order, times, arrays)
+            law = curve_equation(one, library, order, times, arrays)
             self.sets.append(SampleSet(law, scaled, arrays.move(np.concatenate(shares, axis=1))))
 
     def loss(self, weights: Array, xi: Array, gradient: Array, coefficient_gradient: Array) -> Array:
@@ -190,7 +190,7 @@ class NetworkLoss:
         out = self.work.out
         return out[..., : self.points, block] * self.units, out[..., len(self.x) :, block] * (self.units / self.half)
 
-    def _residuals(self, law: Equation, block: slice, xi: Array, coefficient_gradient: Array) -> Array:
+    def _residuals(self, law: CurveEquation, block: slice, xi: Array, coefficient_gradient: Array) -> Array:
         """Return the loss (...) of a set's residuals, write its derivative by the outputs and add that by xi."""
         fields, rates = self._fields(block)
         by_fields, by_rates = self.arrays.xp.zeros_like(fields), self.arrays.xp.zeros_like(rates)

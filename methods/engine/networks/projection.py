@@ -26,7 +26,7 @@ import numpy as np
 
 from latticebench.methods.engine.derivatives import DEGREE, differentiate
 from latticebench.methods.engine.networks.arrays import host
-from latticebench.methods.engine.networks.equation import columns, equation
+from latticebench.methods.engine.networks.equation import columns, curve_equation
 from latticebench.methods.engine.networks.hidden_units import Basis, draw_basis, stack_bases
 from latticebench.methods.method import Skipped, Smooth
 from latticebench.systems.lattice import Library
@@ -63,7 +63,7 @@ class Neighbour(NamedTuple):
     """An output that the right-hand side at a site reads.
 
     Attributes:
-        slope: number of the derivative by it, among those that `Equation.evaluate` returns.
+        slope: number of the derivative by it, among those that `CurveEquation.evaluate` returns.
         output: its number.
         factor: that of the ghost that it is, 1 for a site within the chain.
         velocity: whether its time derivative is read.
@@ -132,7 +132,7 @@ class Curve:
         steepness = settings.bandwidth * (sizes.rate / (sizes.velocity if order == 2 else sizes.field))
         drawn = [draw_basis(times, samples.t, settings.width, steepness, draw) for draw in draws]
         self.grid, self.at = (stack_bases(bases, arrays, lead) for bases in zip(*drawn, strict=True))
-        self.law = equation(samples, library, order, times, arrays)
+        self.law = curve_equation(samples, library, order, times, arrays)
         self.outputs = self.law.parts * samples.sites
         self.units = self.grid.value.shape[-1]
         self.unknowns = self.outputs * self.units
@@ -296,7 +296,7 @@ def _smoothing_spline(t: ndarray, values: ndarray, times: ndarray) -> ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class ProjectedStep:
     """Where a step leads, and the factorised equations that it came from.
 
     Attributes:
@@ -314,7 +314,9 @@ class Step:
     sound: Array
 
 
-def step(curves: Sequence[Curve], at: Sequence[Array], xi: Array, weight: float, damping: Array, *, hat: bool) -> Step:
+def projected_step(
+    curves: Sequence[Curve], at: Sequence[Array], xi: Array, weight: float, damping: Array, *, hat: bool
+) -> ProjectedStep:
     """Solve the damped normal equations, trajectory by trajectory, with xi eliminated by its Schur complement.
 
     Args:
@@ -362,7 +364,7 @@ def step(curves: Sequence[Curve], at: Sequence[Array], xi: Array, weight: float,
     for curve, a, (both, scale) in zip(curves, at, solved, strict=True):
         shift = (both[..., -1] - (both[..., :-1] @ change[..., None])[..., 0]) * scale
         moved.append(a + shift.reshape(*xi.shape[:-1], curve.outputs, curve.units).mT)
-    return Step(moved, xi + change, freedom + (count if hat else 0), inverse, sound)
+    return ProjectedStep(moved, xi + change, freedom + (count if hat else 0), inverse, sound)
 
 
 def _pseudoinverse(schur: Float[ndarray, "*member terms terms"]) -> tuple[ndarray, ndarray]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from latticebench.methods.engine.networks.arrays import Arrays
-from latticebench.methods.engine.networks.projection import Curve, CurveSettings, step
+from latticebench.methods.engine.networks.projection import Curve, CurveSettings, projected_step
 from latticebench.methods.engine.networks.sizes import estimate_sizes
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.samples import Samples
@@ -62,7 +62,7 @@ def test_a_step_and_the_trace_of_the_hat_matrix_are_those_of_plain_linear_algebr
     xi = np.array([0.5, 0.2, -0.3, 0.1])
     matrix, right = curve.normal(curve.weights, xi, 0.3)
     change = np.linalg.solve(matrix, right)
-    found = step([curve], [curve.weights], xi, 0.3, np.float64(0.0), hat=True)
+    found = projected_step([curve], [curve.weights], xi, 0.3, np.float64(0.0), hat=True)
     np.testing.assert_allclose(found.coefficients - xi, change[curve.unknowns :], rtol=1e-5, atol=1e-8)
     moved = change[: curve.unknowns].reshape(curve.outputs, curve.units).T
     np.testing.assert_allclose(found.weights[0] - curve.weights, moved, rtol=1e-4, atol=1e-7)
