@@ -1,1 +1,1 @@
-"""What people and programs see of a diagnosis: text, JSON, and an HTML page."""
+"""What people and programs see: a diagnosis as text, JSON and HTML page, and the JSON documents of all commands."""

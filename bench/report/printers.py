@@ -22,7 +22,7 @@ class LatticeLatex(LatexPrinter):  # type: ignore[misc]
 
     def _print_Sum(self, total: Any) -> str:
         ((index, low, _),) = total.limits
-        return rf"\sum_{{{index} \ge {low}}} {self._print(total.function)}"
+        return rf"\sum_{{{index} \geq {low}}} {self._print(total.function)}"
 
 
 class LatticeMathML(MathMLPresentationPrinter):  # type: ignore[misc]

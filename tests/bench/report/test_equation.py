@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.mathtext import MathTextParser
 
 from latticebench.bench.report import mathematics
 from latticebench.bench.report.equation import Equation, equation
@@ -78,8 +79,11 @@ def test_every_effect_alone_and_all_pairs_can_be_written_in_every_form(
     every = [change for effect in CATALOGUE for change in changes(effect, order, is_complex)]
     assert len(every) > 20
     assert {change.effect.acts for change in every} >= {"harmonic", "pulse", "delayed", "long range", "offset"}
+    reader = MathTextParser("path")
     for change in every:
-        check(shown(declared, [change], order, is_complex), [change])
+        found = shown(declared, [change], order, is_complex)
+        check(found, [change])
+        reader.parse(f"${found.latex}$")
     for pair in itertools.combinations(every, 2):
         check(shown(declared, list(pair), order, is_complex), list(pair))
 
