@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, JsonValue
+from pydantic import BeforeValidator, Field, JsonValue
 
 from latticebench.bench.report.document import Content, Document, Number, Provenance
 
 if TYPE_CHECKING:
+    from latticebench.bench.compare import Comparison
     from latticebench.bench.limit import Design, Limit
     from latticebench.methods.method import Fit
+
+# pandas has NaN where a text or a truth value is missing.
+Text = Annotated[str | None, BeforeValidator(lambda value: None if value != value else value)]
+Flag = Annotated[bool | None, BeforeValidator(lambda value: None if value != value else value)]
 
 
 class FitDocument(Document):
@@ -85,8 +91,8 @@ class LimitDocument(Document):
     needed: Needed
 
 
-class CaseRow(Content):
-    """A row of the table of cases; scores of a case that gave none are null."""
+class FitRow(Content):
+    """A row of the table of fits; a score that a case has not is null."""
 
     part: str
     data: str
@@ -113,17 +119,59 @@ class CaseRow(Content):
     identity: str
 
 
+class Diagnosed(Content):
+    """What the rows of trials and of recordings have in common; null where there is no diagnosis."""
+
+    status: str
+    verdict: Text
+    named: Text
+    residual_before: Number
+    residual_after: Number
+    forecast_before: Number
+    forecast_after: Number
+    seconds: Number
+    message: Text
+
+
+class TrialRow(Diagnosed):
+    """A row of the table of trials of the diagnosis."""
+
+    system: str
+    effect: str
+    z: Number
+    noise: Number
+    velocities: bool
+    seed: int
+    size: Number
+    apart: Number
+    alike: str
+    right: Flag
+    extra: Number
+    forecast_true: Number
+    coefficients_before: Number
+    coefficients_after: Number
+    cpu_seconds: Number
+
+
+class RecordingRow(Diagnosed):
+    """A row of the table of measured recordings."""
+
+    name: str
+    file: str
+    terms: str
+
+
 class RunDocument(Document):
-    """The results of a run, see `latticebench run` and `latticebench table`."""
+    """The results of a run, one row per case, see `latticebench run` and `latticebench table`."""
 
     schema_: Literal["latticebench/run/1"] = Field(
         default="latticebench/run/1", validation_alias="schema", serialization_alias="schema"
     )
-    cases: list[CaseRow]
+    cases: list[FitRow | TrialRow | RecordingRow]
 
 
 class ComparedCase(Content):
-    """A case that got worse or better: its error or status in both runs, and the ratio of the errors."""
+    """A case that got worse or better: what it was in both runs, in words, and the ratio of its errors."""
 
     case: str
     old: str
@@ -184,4 +232,23 @@ def limit_document(found: Limit, needed: Design, note: str, about: Provenance) -
         },
         groups=[[texts[k] for k in group] for group in found.groups],
         needed=Needed(**dataclasses.asdict(needed)),
+    )  # fmt: skip
+
+
+def run_document(rows: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> RunDocument:
+    """Return the document of a run.
+
+    Args:
+        rows: of the table of cases, see `bench.kinds.rows`.
+        about: the description of the results, see `bench.provenance.describe`.
+    """
+    return RunDocument.model_validate({"provenance": {"command": "", **about}, "cases": rows})
+
+
+def compare_document(found: Comparison, about: Provenance) -> CompareDocument:
+    """Return the document of a comparison."""
+    return CompareDocument(
+        provenance=about, same=found.same, gone=found.gone, new=found.fresh,
+        worse=[ComparedCase.model_validate(row) for row in found.worse.to_dict("records")],
+        better=[ComparedCase.model_validate(row) for row in found.better.to_dict("records")],
     )  # fmt: skip

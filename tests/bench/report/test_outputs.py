@@ -15,20 +15,26 @@ import pydantic
 import pytest
 
 from latticebench.bench import cli
-from latticebench.bench.case import blank
+from latticebench.bench.case import Case
 from latticebench.bench.cli.arguments import jsonable
-from latticebench.bench.compare import compare
+from latticebench.bench.compare import compare, of_fits
+from latticebench.bench.fitting import FitCase
 from latticebench.bench.provenance import describe, origin
 from latticebench.bench.report.document import Content, Number, Provenance, provenance, to_json
 from latticebench.bench.report.outputs import (
-    CompareDocument,
     FitDocument,
-    RunDocument,
+    FitRow,
+    RecordingRow,
+    compare_document,
     fit_document,
+    run_document,
 )
 from latticebench.bench.report.schema import DOCUMENTS, json_schema
-from latticebench.bench.suite import Case
 from latticebench.bench.tables import cases
+from latticebench.bench.trials import recorded, scores
+from latticebench.bench.trials.measured import Measured
+from latticebench.bench.trials.trial import Trial
+from latticebench.bench.worker import outcome
 from latticebench.methods.method import Fit
 from latticebench.systems.lattice import library
 
@@ -120,21 +126,41 @@ def test_recordings_are_listed_in_the_published_form(
     assert found["kind"] == "recordings"
 
 
-def result(seed: int, e2: float | str | None, status: str = "ok") -> dict[str, Any]:
-    case = Case(system="phi4", library="lib1", label="a", method="a", seed=seed)
-    return {**blank(case, status, ""), "e2": e2, "made": origin()}
+def row(case: Case, status: str, **found: Any) -> dict[str, Any]:
+    """A result as the store gives it."""
+    about = {"case": case.model_dump(mode="json"), "identity": case.identity, "made": origin()}
+    return {**outcome(case, status, "" if status == "ok" else "it was so", {**case.blank(), **found}), **about}
 
 
-def test_the_table_of_cases_and_a_comparison_have_the_published_form(conforms: Conforms) -> None:
-    old, new = ([result(1, 0.1), result(2, "inf"), result(3, None, "failed")], [result(1, 0.5), result(2, 0.1)])
-    about = Provenance(**{"command": "latticebench run mine", **describe(old, {})})
-    table = RunDocument.model_validate({"provenance": about, "cases": cases(old).to_dict("records")})
-    rows = conforms("run", to_json(table))["cases"]
-    assert [row["e2"] for row in rows] == [0.1, "inf", None]
-    judged = compare(cases(old), cases(new))
-    comparison = CompareDocument(
-        provenance=provenance(), worse=judged.worse.to_dict("records"), better=judged.better.to_dict("records"),
-        same=judged.same, gone=judged.gone, new=judged.fresh,
-    )  # fmt: skip
-    found = conforms("compare", to_json(comparison))
+def fit(seed: int, e2: float | str | None, status: str = "ok") -> dict[str, Any]:
+    return row(FitCase(system="phi4", library="lib1", label="a", method="a", seed=seed), status, e2=e2)
+
+
+def test_a_run_of_all_kinds_has_the_published_form(conforms: Conforms) -> None:
+    trial, recording = Trial(system="phi4", effect="damping", z=10), Measured(name="a", file="a", terms="u[n]", order=2)
+    report = {
+        "verdict": "explained", "effects": [{"effect": "damping"}],
+        "error": {name: {"before": "inf", "after": 1.0} for name in ("residual", "forecast")},
+    }  # fmt: skip
+    found = {"named": ["damping"], "alike": [[]], "verdict": "explained", "apart": 0.0, "residual_after": 1.0}
+    tables = [
+        cases([fit(1, 0.1), fit(2, "inf"), fit(3, None, "failed")]),
+        scores.table([row(trial, "ok", **found), row(trial, "timeout")]),
+        recorded.table([row(recording, "ok", report=report), row(recording, "skipped")]),
+    ]
+    every = [one for table in tables for one in table.to_dict("records")]
+    written = conforms("run", to_json(run_document(every, describe([origin()], {"command": "x", "jobs": 2}, [1, 2]))))
+    assert [one["e2"] for one in written["cases"][:3]] == [0.1, "inf", None]
+    assert [one["right"] for one in written["cases"][3:5]] == [True, None]
+    assert [one["forecast_before"] for one in written["cases"][5:]] == ["inf", None]
+    assert [list(one) for one in (written["cases"][0], written["cases"][5])] == [
+        list(FitRow.model_fields), list(RecordingRow.model_fields),
+    ]  # fmt: skip
+
+
+def test_a_comparison_has_the_published_form(conforms: Conforms) -> None:
+    old, new = ([fit(1, 0.1), fit(2, "inf"), fit(3, None, "failed")], [fit(1, 0.5), fit(2, 0.1)])
+    judged = compare(*(of_fits(cases(results)) for results in (old, new)))
+    found = conforms("compare", to_json(compare_document(judged, provenance())))
     assert [len(found[key]) for key in ("worse", "better", "gone", "new")] == [1, 1, 1, 0]
+    assert found["worse"][0]["ratio"] == 5
