@@ -20,12 +20,13 @@ from latticebench.systems.samples import Samples
 
 @dataclass(frozen=True)
 class Hostile:
-    """Does what `deed` says."""
+    """Does what `deed` says, once the file `gate` is there; `diary` gets a line at the start of each fit."""
 
     name: ClassVar[str] = "hostile"
     deed: str = "behave"
     seconds: float = 0.0
     diary: str = ""
+    gate: str = ""
 
     @property
     def abilities(self) -> Abilities:
@@ -34,15 +35,16 @@ class Hostile:
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         if self.diary:
             with Path(self.diary).open("a") as diary:
-                diary.write(f"{self.deed} {self.seconds} {os.getpid()}\n")
+                diary.write(f"{self.deed} {seed} {os.getpid()}\n")
+        while self.gate and not Path(self.gate).exists():
+            time.sleep(0.02)
         if self.deed == "fail":
             raise RuntimeError("the matrix is on holiday")
         if self.deed == "eat":
-            eaten = []
-            while True:
-                eaten.append(np.ones(2**25))
+            eaten = np.ones(2**28)  # 2 GiB, held until somebody ends it
+            time.sleep(1e6 * eaten[0])
         if self.deed == "hang in C":
-            ctypes.PyDLL(None).sleep(600)  # holds the interpreter's lock
+            ctypes.PyDLL(None).sleep(100_000)  # holds the interpreter's lock
         if self.deed == "die":
             os.kill(os.getpid(), signal.SIGKILL)
         if self.deed == "write":

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
+
+from latticebench.bench.cli import main
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "measured"
 
 
 def latticebench(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "error", "-m", "latticebench", *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, timeout=300)
+    """Run a command within this process, which saves the imports of a process of its own."""
+    command = ["latticebench", *map(str, arguments)]
+    out, err, before = io.StringIO(), io.StringIO(), Path.cwd()
+    os.chdir(cwd)
+    try:
+        with (
+            mock.patch.object(sys, "argv", command), redirect_stdout(out), redirect_stderr(err),
+            pytest.raises(SystemExit) as end,
+        ):  # fmt: skip
+            main()
+    finally:
+        os.chdir(before)
+    return subprocess.CompletedProcess(command, int(end.value.code or 0), out.getvalue(), err.getvalue())
 
 
 def succeed(*arguments: object, cwd: Path) -> str:
@@ -145,47 +161,53 @@ def test_the_limit_of_a_file_is_near_the_one_of_the_system_that_it_came_from(fol
     assert "within reach as things are" in succeed("limit", "phi4.csv", "--ends", "free", *about[:4], cwd=folder)
 
 
-def test_a_run_its_table_its_figures_and_its_comparison(tmp_path: Path) -> None:
-    out = succeed("run", "tiny", "--jobs", 2, "--results", "tiny", cwd=tmp_path)
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the results of the suite tiny."""
+    place = tmp_path_factory.mktemp("tiny")
+    out = succeed("run", "tiny", "--jobs", 2, "--results", "tiny", cwd=place)
     assert "9 cases (9 ok); 9 run now, 0 were there" in out
     assert "phi4 noise=0.01" in out
-    again = succeed("run", "tiny", "--results", "tiny", cwd=tmp_path)
+    return place
+
+
+def test_a_run_its_table_its_figures_and_its_comparison(tiny: Path) -> None:
+    again = succeed("run", "tiny", "--results", "tiny", cwd=tiny)
     assert "0 run now, 9 were there" in again
-    rows = json.loads(succeed("table", "tiny", "--out", "published", "--json", cwd=tmp_path))
+    rows = json.loads(succeed("table", "tiny", "--out", "published", "--json", cwd=tiny))
     assert len(rows) == 9
     for name in ("cases", "coefficients", "summary", "errors"):
         for form in ("csv", "md", "tex"):
-            text = (tmp_path / "published" / f"{name}.{form}").read_text()
+            text = (tiny / "published" / f"{name}.{form}").read_text()
             for word in ("command: latticebench run tiny", "commit: ", "machine: ", "versions: ", "seeds: 1"):
                 assert word in text
-    assert "known to" in (tmp_path / "published" / "coefficients.md").read_text()
-    one = succeed("table", "tiny", "--only", "limits", "--out", "one", cwd=tmp_path)
-    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == ["limits.csv", "limits.md", "limits.tex"]
+    assert "known to" in (tiny / "published" / "coefficients.md").read_text()
+    one = succeed("table", "tiny", "--only", "limits", "--out", "one", cwd=tiny)
+    assert sorted(path.name for path in (tiny / "one").iterdir()) == ["limits.csv", "limits.md", "limits.tex"]
     assert "bound" in one
     assert (
         "unknown figure 'cots'; did you mean 'cost'"
-        in latticebench("figures", "tiny", "--only", "cots", cwd=tmp_path).stderr
+        in latticebench("figures", "tiny", "--only", "cots", cwd=tiny).stderr
     )
-    files = succeed("figures", "tiny", "--out", "published", cwd=tmp_path).split()
+    files = succeed("figures", "tiny", "--out", "published", cwd=tiny).split()
     assert {Path(file).name for file in files} >= {"errors.png", "error-against-seconds.png", "error-against-noise.png"}
-    assert all((tmp_path / file).stat().st_size > 5000 for file in files)
-    assert "0 worse, 0 better, 9 the same" in succeed("compare", "tiny", "published", cwd=tmp_path)
+    assert all((tiny / file).stat().st_size > 5000 for file in files)
+    assert "0 worse, 0 better, 9 the same" in succeed("compare", "tiny", "published", cwd=tiny)
 
 
-def test_comparing_names_what_got_worse_and_exits_with_1(tmp_path: Path) -> None:
-    succeed("run", "tiny", "--results", "tiny", cwd=tmp_path)
-    succeed("table", "tiny", "--out", "old", cwd=tmp_path)
-    table = (tmp_path / "old" / "cases.csv").read_text()
+def test_comparing_names_what_got_worse_and_exits_with_1(tiny: Path) -> None:
+    succeed("table", "tiny", "--out", "old", cwd=tiny)
+    table = (tiny / "old" / "cases.csv").read_text()
     assert "0.00763" in table or "0.0076" in table
     import pandas as pd
 
-    frame = pd.read_csv(tmp_path / "old" / "cases.csv", comment="#")
+    frame = pd.read_csv(tiny / "old" / "cases.csv", comment="#")
     frame.loc[(frame.method == "stlsq") & (frame.noise == 0.01), "e2"] /= 10
-    frame.to_csv(tmp_path / "better.csv", index=False)
-    worse = latticebench("compare", "better.csv", "tiny", cwd=tmp_path)
+    frame.to_csv(tiny / "better.csv", index=False)
+    worse = latticebench("compare", "better.csv", "tiny", cwd=tiny)
     assert worse.returncode == 1
     assert "worse: phi4 noise=0.01 | lib2 | stlsq | seed 1" in worse.stdout
-    better = latticebench("compare", "tiny", "better.csv", "--json", cwd=tmp_path)
+    better = latticebench("compare", "tiny", "better.csv", "--json", cwd=tiny)
     assert better.returncode == 0
     assert len(json.loads(better.stdout)["better"]) == 1
 

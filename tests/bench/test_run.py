@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,16 +30,23 @@ from latticebench.systems.simulate import sample_times, simulate
 
 HERE = Path(__file__).parent
 posix = pytest.mark.skipif(os.name != "posix", reason="sends POSIX signals")
+# Seconds after which something that should have happened is taken to have failed: far beyond what a busy machine needs.
+PATIENCE = 300.0
+LONG = "time_limit = 3600"
 
 
-def hostile_suite(folder: Path, methods: dict[str, str], *, seeds: str = "[1]", limits: str = "") -> Suite:
-    """Write a suite with one entry a method: its label and its settings."""
+def hostile_suite(
+    folder: Path, methods: dict[str, str], *, seeds: str = "[1]", limits: dict[str, str] | None = None
+) -> Suite:
+    """Write a suite with one entry per method, its label and its settings; by default nothing runs into a limit."""
     folder.mkdir(exist_ok=True)
     shutil.copy(HERE / "hostile.py", folder / "hostile.py")
     text = 'title = "hostile"\n'
     for label, settings in methods.items():
         text += f'[methods."{label}"]\nmethod = "hostile.py"\nsettings = {{ {settings} }}\n'
-    text += f'[[grid]]\nsystem = "phi4"\nsites = 5\nsamples = 8\nspan = 1.0\nlibraries = ["lib1"]\nseeds = {seeds}\n{limits}\n'
+    for label in methods:
+        text += f'[[grid]]\nmethods = ["{label}"]\nsystem = "phi4"\nsites = 5\nsamples = 8\nspan = 1.0\n'
+        text += f'libraries = ["lib1"]\nseeds = {seeds}\n{(limits or {}).get(label, LONG)}\n'
     (folder / "hostile.toml").write_text(text)
     return load(str(folder / "hostile.toml"))
 
@@ -70,7 +79,7 @@ def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other
             "good": 'deed = "behave"', "failing": 'deed = "fail"', "eating": 'deed = "eat"',
             "hanging": 'deed = "hang in C"', "dying": 'deed = "die"', "empty": 'deed = "nan"', "slow": "seconds = 0.5",
         },
-        seeds="[1, 2]", limits="time_limit = 8\nmemory_limit = 1500",
+        seeds="[1, 2]", limits={"hanging": "time_limit = 2", "eating": f"{LONG}\nmemory_limit = 1500"},
     )  # fmt: skip
     results, tally = finished(suite, create(tmp_path / "store"), jobs=2)
     found = {(r["case"]["label"], r["case"]["seed"]): r for r in results}
@@ -82,7 +91,7 @@ def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other
         assert found["eating", seed]["status"] == "memory"
         assert "1500 MiB" in found["eating", seed]["reason"]
         assert found["hanging", seed]["status"] == "timeout"
-        assert "8 s" in found["hanging", seed]["reason"]
+        assert "2 s" in found["hanging", seed]["reason"]
         assert found["dying", seed]["status"] == "died"
         assert found["empty", seed]["status"] == "failed"
         assert "not finite" in found["empty", seed]["reason"]
@@ -104,11 +113,13 @@ def test_finished_cases_are_not_run_again_and_failures_only_when_asked(tmp_path:
 
 
 def test_a_raised_time_limit_runs_a_timed_out_case_again(tmp_path: Path) -> None:
-    slow = {"slow": "seconds = 1.5"}
+    gate = tmp_path / "gate"
+    held = {"held": f'gate = "{gate}"'}
     store = create(tmp_path / "store")
-    results, _ = finished(hostile_suite(tmp_path / "s", slow, limits="time_limit = 0.5"), store, jobs=1)
+    results, _ = finished(hostile_suite(tmp_path / "s", held, limits={"held": "time_limit = 0.5"}), store, jobs=1)
     assert results[0]["status"] == "timeout"
-    results, _ = finished(hostile_suite(tmp_path / "s", slow, limits="time_limit = 60"), store, jobs=1)
+    gate.touch()
+    results, _ = finished(hostile_suite(tmp_path / "s", held), store, jobs=1)
     assert results[0]["status"] == "ok"
 
 
@@ -133,73 +144,101 @@ def test_the_number_of_jobs_changes_no_digit(tmp_path: Path) -> None:
         assert a["e2"] == b["e2"]
 
 
-def start_run(suite: Path, store: Path, jobs: int = 2) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "latticebench", "run", str(suite), "--results", str(store), "--jobs", str(jobs)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+StartRun = Callable[[Path, Path], "subprocess.Popen[bytes]"]
 
 
-def wait_for(condition: object, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():  # type: ignore[operator]
+def end_group(leader: int) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(leader, signal.SIGKILL)
+
+
+@pytest.fixture
+def start_run() -> Iterator[StartRun]:
+    """Start `latticebench run` in processes that are all ended with the test, whatever happens in it."""
+    with ExitStack() as ends:
+
+        def start(suite: Path, store: Path) -> subprocess.Popen[bytes]:
+            command = [sys.executable, "-m", "latticebench", "run", str(suite), "--results", str(store), "--jobs", "2"]
+            runner = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
+            ends.enter_context(runner)
+            ends.callback(end_group if os.name == "posix" else lambda _: runner.kill(), runner.pid)
+            return runner
+
+        yield start
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
         assert time.monotonic() < end, "it did not happen in time"
         time.sleep(0.05)
 
 
+def gone(workers: list[psutil.Process]) -> bool:
+    return not any(worker.is_running() and worker.status() != psutil.STATUS_ZOMBIE for worker in workers)
+
+
 @posix
-def test_after_kill_9_of_the_runner_nothing_finished_is_run_again_and_no_worker_stays(tmp_path: Path) -> None:
-    diary = tmp_path / "diary"
-    seeds = str(list(range(8)))
-    hostile_suite(tmp_path / "s", {"good": f'seconds = 0.4, diary = "{diary}"'}, seeds=seeds)
-    suite_file, store = tmp_path / "s" / "hostile.toml", tmp_path / "store"
-    runner = start_run(suite_file, store)
-    wait_for(lambda: count(store) >= 3)
+def test_after_kill_9_of_the_runner_nothing_finished_is_run_again_and_no_worker_stays(
+    start_run: StartRun, tmp_path: Path
+) -> None:
+    diary, gate, store = tmp_path / "diary", tmp_path / "gate", tmp_path / "store"
+    methods = {"quick": f'diary = "{diary}"', "held": f'deed = "held", diary = "{diary}", gate = "{gate}"'}
+    hostile_suite(tmp_path / "s", methods, seeds="[1, 2, 3]")
+    runner = start_run(tmp_path / "s" / "hostile.toml", store)
+    wait_for(lambda: count(store) == 3 and len(diary_lines(diary)) == 5)
     workers = psutil.Process(runner.pid).children(recursive=True)
     runner.kill()
-    runner.communicate()
-    there = count(store)
-    started = len(diary_lines(diary))
-    wait_for(lambda: not any(w.is_running() and w.status() != psutil.STATUS_ZOMBIE for w in workers), 20)
-    again = start_run(suite_file, store)
-    out, err = again.communicate(timeout=120)
+    runner.communicate(timeout=PATIENCE)
+    wait_for(lambda: gone(workers))
+    gate.touch()
+    again = start_run(tmp_path / "s" / "hostile.toml", store)
+    out, err = again.communicate(timeout=PATIENCE)
     assert again.returncode == 0, err
-    assert f"{8 - there} run now, {there} were there".encode() in out
-    assert len(diary_lines(diary)) <= started + 8 - there
-    assert open_store(store).statuses() == {"ok": 8}
+    assert b"3 run now, 3 were there" in out
+    assert sorted(line.split()[0] for line in diary_lines(diary)) == ["behave"] * 3 + ["held"] * 5
+    assert open_store(store).statuses() == {"ok": 6}
 
 
 @posix
-def test_after_kill_9_of_a_worker_its_case_is_run_again_and_all_get_their_result(tmp_path: Path) -> None:
-    diary = tmp_path / "diary"
-    hostile_suite(tmp_path / "s", {"good": f'seconds = 0.8, diary = "{diary}"'}, seeds="[1, 2, 3, 4]")
+def test_after_kill_9_of_a_worker_its_case_is_run_again_and_all_get_their_result(
+    start_run: StartRun, tmp_path: Path
+) -> None:
+    diary, gate = tmp_path / "diary", tmp_path / "gate"
+    hostile_suite(tmp_path / "s", {"held": f'diary = "{diary}", gate = "{gate}"'}, seeds="[1, 2, 3, 4]")
     runner = start_run(tmp_path / "s" / "hostile.toml", tmp_path / "store")
     wait_for(lambda: len(diary_lines(diary)) >= 1)
-    os.kill(int(diary_lines(diary)[0].split()[-1]), signal.SIGKILL)
-    out, err = runner.communicate(timeout=120)
+    _, seed, worker = diary_lines(diary)[0].split()
+    os.kill(int(worker), signal.SIGKILL)
+    wait_for(lambda: sum(line.split()[1] == seed for line in diary_lines(diary)) == 2)
+    gate.touch()
+    out, err = runner.communicate(timeout=PATIENCE)
     assert runner.returncode == 0, err
     assert b"4 cases (4 ok)" in out
 
 
 @posix
-def test_ctrl_c_ends_at_once_with_the_finished_cases_kept(tmp_path: Path) -> None:
-    hostile_suite(tmp_path / "s", {"good": "seconds = 0.3", "long": "seconds = 100"})
-    store = tmp_path / "store"
+def test_ctrl_c_ends_at_once_with_the_finished_cases_kept(start_run: StartRun, tmp_path: Path) -> None:
+    """At once: the case that is under way would never end by itself."""
+    diary, store = tmp_path / "diary", tmp_path / "store"
+    hostile_suite(tmp_path / "s", {"quick": "", "held": f'diary = "{diary}", gate = "{tmp_path / "never"}"'})
     runner = start_run(tmp_path / "s" / "hostile.toml", store)
-    wait_for(lambda: count(store) >= 1)
+    wait_for(lambda: count(store) == 1 and len(diary_lines(diary)) == 1)
     workers = psutil.Process(runner.pid).children(recursive=True)
     os.killpg(runner.pid, signal.SIGINT)
-    _, err = runner.communicate(timeout=20)
+    _, err = runner.communicate(timeout=PATIENCE)
     assert runner.returncode == 130
     assert b"Traceback" not in err
     assert b"the same command continues" in err
-    wait_for(lambda: not any(w.is_running() and w.status() != psutil.STATUS_ZOMBIE for w in workers), 10)
+    wait_for(lambda: gone(workers))
     assert count(store) == 1
 
 
-def test_two_runs_on_one_store_do_not_corrupt_it(tmp_path: Path) -> None:
+def test_two_runs_on_one_store_do_not_corrupt_it(start_run: StartRun, tmp_path: Path) -> None:
     hostile_suite(tmp_path / "s", {"good": "seconds = 0.1"}, seeds=str(list(range(10))))
     runners = [start_run(tmp_path / "s" / "hostile.toml", tmp_path / "store") for _ in range(2)]
     for runner in runners:
-        out, err = runner.communicate(timeout=120)
+        out, err = runner.communicate(timeout=PATIENCE)
         assert runner.returncode == 0, err
         assert b"10 cases (10 ok)" in out
     assert len(list(open_store(tmp_path / "store").results())) == 10
@@ -225,7 +264,8 @@ def test_a_table_shows_the_suite_that_was_run_last_and_where_each_result_came_fr
 def test_a_noisy_case_holds_its_bound_and_one_without_noise_or_truth_none(tmp_path: Path) -> None:
     def case(**changed: Any) -> FitCase:
         return FitCase(**{
-            "system": "phi4", "sites": 9, "samples": 20, "noise": 0.01, "library": "lib2", "label": "a", "method": "zero", **changed
+            "system": "phi4", "sites": 9, "samples": 20, "noise": 0.01, "library": "lib2", "label": "a", "method": "zero",
+            **changed,
         })  # fmt: skip
 
     found = attempt(case(known_ends=True), Folders(tmp_path))
