@@ -1,6 +1,6 @@
 """Find the equations of motion of nonlinear lattices from data, and measure how well each method does it.
 
-Four rooms, imported one way only (`bench` -> `diagnosis` -> `methods` -> `systems`); each is loaded when it is first used:
+Four rooms, each loaded when it is first used and importing only from those above it in this list:
 
 - `latticebench.systems`: what is studied - terms, lattices, samples, simulation;
 - `latticebench.methods`: how an equation is found - the protocol, and one file per method;

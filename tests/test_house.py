@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,8 +19,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = ("systems", "methods", "diagnosis", "bench")
 MOST_LINES_OF_A_FILE = 500
 MOST_LINES_OF_A_FUNCTION = 60
-# The search and the verdict of the diagnosis, which are going to be replaced as a whole.
-LONG_FILES: set[str] = set()
+MOST_CHARACTERS = 120
 # What a method may share with others.
 SHARED = ("latticebench.methods.method", "latticebench.methods.engine")
 SOURCES = {
@@ -28,7 +28,6 @@ SOURCES = {
     for path in sorted((ROOT / room).rglob("*.py"))
 }
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in SOURCES.items()}
-EVERY = pytest.mark.parametrize("module", SOURCES)
 
 
 def imports(module: str) -> Iterator[tuple[str, str]]:
@@ -52,48 +51,55 @@ def is_method(module: str) -> bool:
     return module.startswith("latticebench.methods.") and not module.startswith(SHARED)
 
 
-@EVERY
-def test_imports_point_downwards_only(module: str) -> None:
-    above = ROOMS[ROOMS.index(room(module)) + 1 :]
-    for name, _ in imports(module):
-        assert room(name) not in above or not name.startswith("latticebench."), f"{module} imports {name}"
+def test_imports_point_downwards_only() -> None:
+    def above(module: str) -> tuple[str, ...]:
+        return ROOMS[ROOMS.index(room(module)) + 1 :]
+
+    assert not [
+        (one, name) for one in SOURCES for name, _ in imports(one) if name in SOURCES and room(name) in above(one)
+    ]
 
 
 def test_imports_run_in_no_circle() -> None:
     graph = {module: {name for name, _ in imports(module) if name in SOURCES} - {module} for module in SOURCES}
-    # A room's face looks its modules up by name, and app.py of the command line is what its face hands on.
     list(TopologicalSorter(graph).static_order())
 
 
-@EVERY
-def test_no_private_name_is_used_by_another_module(module: str) -> None:
-    aliases = set()
+def test_no_private_name_is_used_by_another_module() -> None:
+    assert not [(module, name) for module in SOURCES for name in private_names(module)]
+
+
+def private_names(module: str) -> Iterator[str]:
+    """Yield the names with a leading underscore that a module takes from others of this project."""
+    ours = set()
     for node in ast.walk(TREES[module]):
         if isinstance(node, ast.ImportFrom):
-            aliases |= {alias.asname or alias.name for alias in node.names if f"{node.module}.{alias.name}" in SOURCES}
-    taken = [name for where, name in imports(module) if where.startswith("latticebench") and name.startswith("_")]
-    taken += [
-        f"{node.value.id}.{node.attr}"
-        for node in ast.walk(TREES[module])
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
-        and node.value.id in aliases and node.attr.startswith("_") and not node.attr.startswith("__")
-    ]  # fmt: skip
-    assert not [name for name in taken if not name.startswith("__")]
+            ours |= {alias.asname or alias.name for alias in node.names if f"{node.module}.{alias.name}" in SOURCES}
+    for where, name in imports(module):
+        if where.startswith("latticebench") and name.startswith("_") and not name.startswith("__"):
+            yield f"{where}.{name}"
+    for node in ast.walk(TREES[module]):
+        if (
+            isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in ours
+            and node.attr.startswith("_") and not node.attr.startswith("__")
+        ):  # fmt: skip
+            yield f"{node.value.id}.{node.attr}"
 
 
-@EVERY
-def test_a_method_is_imported_by_its_registry_alone(module: str) -> None:
-    assert not [name for name, _ in imports(module) if is_method(name) and name != module]
+def test_a_method_is_imported_by_its_registry_alone() -> None:
+    assert not [(one, name) for one in SOURCES for name, _ in imports(one) if is_method(name) and name != one]
 
 
-@pytest.mark.parametrize("module", [module for module in SOURCES if room(module) in ("diagnosis", "bench")])
-def test_no_code_above_the_methods_names_a_method_or_a_system(module: str) -> None:
-    assert not texts(module) & {*systems.names(), *methods.registered()}
+def test_nothing_above_the_methods_names_a_method_or_a_system() -> None:
+    names = {*systems.names(), *methods.registered()}
+    assert not [
+        (one, texts(one) & names) for one in SOURCES if room(one) in ("diagnosis", "bench") if texts(one) & names
+    ]
 
 
-@pytest.mark.parametrize("module", [module for module in SOURCES if room(module) == "methods"])
-def test_no_method_names_a_system(module: str) -> None:
-    assert not texts(module) & set(systems.names())
+def test_no_method_names_a_system() -> None:
+    names = set(systems.names())
+    assert not [(one, texts(one) & names) for one in SOURCES if room(one) == "methods" and texts(one) & names]
 
 
 def texts(module: str) -> set[str]:
@@ -101,18 +107,23 @@ def texts(module: str) -> set[str]:
     return {value for value in found if isinstance(value, str)}
 
 
-@pytest.mark.parametrize("path", [*SOURCES.values(), *sorted((ROOT / "results").rglob("*.py"))], ids=lambda p: p.stem)
-def test_files_and_functions_are_short_enough_to_be_read(path: Path) -> None:
-    source = path.read_text(encoding="utf-8")
-    long = {
-        node.name: node.end_lineno - node.lineno + 1
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
-        and (node.end_lineno or 0) - node.lineno >= MOST_LINES_OF_A_FUNCTION
-    }
+def test_files_and_functions_are_short_enough_to_be_read() -> None:
+    long = []
+    for path in [*SOURCES.values(), *sorted((ROOT / "results").rglob("*.py"))]:
+        name, source = path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+        if source.count("\n") > MOST_LINES_OF_A_FILE:
+            long.append(name)
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                long += [f"{name}: {node.name}"] if lines > MOST_LINES_OF_A_FUNCTION else []
     assert not long
-    name = path.relative_to(ROOT).as_posix()
-    assert (source.count("\n") > MOST_LINES_OF_A_FILE) == (name in LONG_FILES), name
+
+
+def test_prose_stands_in_lines_of_120_characters() -> None:
+    for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
+        lines = re.sub(r"```.*?```", "", (ROOT / name).read_text(encoding="utf-8"), flags=re.DOTALL).splitlines()
+        assert not [line for line in lines if len(line) > MOST_CHARACTERS and not line.lstrip().startswith("|")], name
 
 
 def test_every_package_is_listed_for_the_wheel() -> None:

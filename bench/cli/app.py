@@ -1,7 +1,7 @@
 """The program: its commands, and what becomes of an error.
 
-Each command is a file with a function whose parameters are its options, and `EPILOG`, the text below its help. Heavy packages are
-imported inside the function, so that `--help`, `list` and tab completion answer at once.
+Each command is a file with a function whose parameters are its options, and `EPILOG`, the text below its help. Heavy
+packages are imported inside the function, so that `--help`, `list` and tab completion answer at once.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Networks whose input is time: their layers and derivatives, the equation on them, losses, minimisers and least squares."""
+"""Networks of time: layers, derivatives, the equation on them, losses, minimisers and least squares."""
