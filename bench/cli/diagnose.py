@@ -85,9 +85,8 @@ def diagnose(
     # Read together, since the two must be of the same chain.
     later = read_all([*files, *holdout], ends)[len(data) :] if holdout else []
     with told(data, method, "the diagnosis"), watching() as watcher, redirect_stdout(sys.stderr):
-        start = (
-            None if method is None else solve(make(methods.find(method), {}), data, declared, order, seed).coefficients
-        )
+        fit = None if method is None else solve(make(methods.find(method), {}), data, declared, order, seed)
+        start = None if fit is None else fit.coefficients
         found = close_the_loop(declared, order, data, catalogue, seed, held_out=later, watcher=watcher, start=start)
     _report(found, seed, json_out, html_out)
 

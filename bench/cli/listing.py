@@ -42,7 +42,8 @@ def _system_rows() -> list[dict[str, Any]]:
             {
                 "name": name, "equation": f"u{chr(39) * system.order} = {system.equation}",
                 "field": "complex" if system.is_complex else "real", "parameters": dict(system.parameters),
-                "initial states": list(system.initials), "ends": system.ends, "sites": system.sites, "source": system.source,
+                "initial states": list(system.initials), "ends": system.ends, "sites": system.sites,
+                "source": system.source,
             }
         )  # fmt: skip
     return rows

@@ -326,7 +326,8 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(command: str, folder: Path)
     (folder / "three.py").write_text("METHODS = (3,)\n")
     (folder / "bare.py").write_text("class Bare:\n    name = 'bare'\n\nMETHODS = (Bare,)\n")
     (folder / "raising.py").write_text(
-        "from latticebench.methods.method import Abilities\n\nclass Raising:\n    name = 'raising'\n    abilities = Abilities()\n\n"
+        "from latticebench.methods.method import Abilities\n\n"
+        "class Raising:\n    name = 'raising'\n    abilities = Abilities()\n\n"
         "    def fit(self, data, library, order, seed):\n        return 1 / 0\n\nMETHODS = (Raising,)\n"
     )
     (folder / "semicolons.csv").write_text("t;u1;u2\n0;1;2\n1;2;3\n")
@@ -347,7 +348,8 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(command: str, folder: Path)
 def test_a_method_and_a_system_from_outside_work_without_touching_the_project(tmp_path: Path) -> None:
     (tmp_path / "guess.py").write_text(
         "from dataclasses import dataclass\nfrom typing import ClassVar\nimport numpy as np\n"
-        "from latticebench.methods.method import Abilities, Fit\nfrom latticebench.methods.engine.regression import rows\n\n"
+        "from latticebench.methods.engine.regression import rows\n"
+        "from latticebench.methods.method import Abilities, Fit\n\n"
         "@dataclass(frozen=True)\nclass Guess:\n    'Least squares, rounded to a grid.'\n\n"
         "    name: ClassVar[str] = 'guess'\n    grid: float = 0.5\n\n"
         "    @property\n    def abilities(self):\n        return Abilities()\n\n"
@@ -408,7 +410,8 @@ def test_the_measured_gliders_give_the_stiffness_of_their_source(tmp_path: Path)
 
 def test_the_measured_pendulum_gives_its_frequency_and_damping(tmp_path: Path) -> None:
     out = succeed(
-        "fit", measured("pendulum.csv"), "--terms", "sin(u[n]); v[n]", "--order", 2, "--method", "least-squares", "--json", "-",
+        "fit", measured("pendulum.csv"), "--terms", "sin(u[n]); v[n]", "--order", 2, "--method", "least-squares",
+        "--json", "-",
         cwd=tmp_path,
     )  # fmt: skip
     found = json.loads(out)

@@ -88,7 +88,8 @@ def test_mirrored_samples_keep_even_terms_out():
         )
         for mirror in (False, True)
     )
-    # A nearly singular problem: how far a training has come along its valley is a matter of rounding, the middle of three is not.
+    # The problem is nearly singular: how far one training has come along its valley is a matter of rounding, the
+    # middle of three is not.
     even = np.max(np.abs(mirrored[:, [1, 3]]), axis=1)
     assert np.median(even / np.max(np.abs(mirrored), axis=1)) < 0.05
     assert np.median(np.max(np.abs(plain[:, [1, 3]]), axis=1) / even) > 5

@@ -1,6 +1,6 @@
 """A network's output weights and an equation's coefficients solved for together by least squares.
 
-The hidden units are fixed (`methods.engine.networks.hidden_units`), so that the fields are linear in the output weights a,
+The hidden units are fixed (`hidden_units` beside this file), so that the fields are linear in the output weights a,
 
     u_n(t) = sum_k a_kn phi_k(t),   du_n/dt = sum_k a_kn dphi_k/dt,   and so on.
 
