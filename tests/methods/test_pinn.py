@@ -81,18 +81,11 @@ def test_mirrored_samples_keep_even_terms_out():
     u = 1 + 0.3 * np.cos(np.sqrt(2) * t)[:, None]
     v = -0.3 * np.sqrt(2) * np.sin(np.sqrt(2) * t)[:, None]
     samples, candidates = Samples(t, u, v), library("lib", "u[n]; u[n]**2; u[n]**3; u[n]**4")
-    settings = FEW | {"adam_steps": 300, "lbfgs_steps": 2000}
-    plain, mirrored = (
-        np.array(
-            [solve(PINN(**settings, mirror=mirror), [samples], candidates, 2, seed).coefficients for seed in range(3)]
-        )
-        for mirror in (False, True)
-    )
-    # The problem is nearly singular: how far one training has come along its valley is a matter of rounding, the
-    # middle of three is not.
-    even = np.max(np.abs(mirrored[:, [1, 3]]), axis=1)
-    assert np.median(even / np.max(np.abs(mirrored), axis=1)) < 0.05
-    assert np.median(np.max(np.abs(plain[:, [1, 3]]), axis=1) / even) > 5
+    settings = FEW | {"adam_steps": 300, "lbfgs_steps": 700}
+    plain = solve(PINN(**settings), [samples], candidates, 2, 0).coefficients
+    mirrored = solve(PINN(**settings, mirror=True), [samples], candidates, 2, 0).coefficients
+    assert np.max(np.abs(mirrored[[1, 3]])) < 0.02 * np.max(np.abs(mirrored))
+    assert np.max(np.abs(plain[[1, 3]])) > 5 * np.max(np.abs(mirrored[[1, 3]]))
 
 
 def test_a_measured_input_is_used_at_every_collocation_time():
