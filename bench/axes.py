@@ -1,4 +1,4 @@
-"""The axes of a block of a suite file: lists, of which one of one value may be written as that value, and ranges of seeds."""
+"""The axes of a block of a suite file: lists (a single value stands for a list of one) and ranges of seeds."""
 
 from __future__ import annotations
 

@@ -54,8 +54,8 @@ class Comparison:
 def compare(old: pd.DataFrame, new: pd.DataFrame, factor: float = FACTOR, floor: float = FLOOR) -> Comparison:
     """Compare the cases that two runs share.
 
-    A case is worse when its diagnosis was right and is wrong; when its E2 (without one: its residual) has grown by more than
-    `factor`, both counted as at least `floor`; or when it had a result and has none any more.
+    A case is worse when its diagnosis was right and is wrong; when its E2 (without one: its residual) has grown by
+    more than `factor`, both counted as at least `floor`; or when it had a result and has none any more.
 
     Args:
         old: see `read_run` and `of_fits`.
@@ -89,7 +89,7 @@ def _change(a: Mapping[Any, Any], b: Mapping[Any, Any], first: float, second: fl
 
 
 def _errors(a: Mapping[Any, Any], b: Mapping[Any, Any]) -> tuple[str, float, float]:
-    """Return the measure that two results have, and the error of both; one without a result, be it skipped, is infinite."""
+    """Return the measure that two results share, and both errors; the error of a case without a result is infinite."""
     measure = "residual" if pd.isna(a["e2"]) and pd.isna(b["e2"]) else "e2"
     first, second = (
         float(one[measure]) if one["status"] == "ok" and not pd.isna(one[measure]) else np.inf for one in (a, b)
@@ -105,7 +105,7 @@ def _shown(row: Mapping[Any, Any], measure: str, error: float) -> str:
     return f"{judged}{'E2' if measure == 'e2' else measure} {error:.3g}"
 
 
-# Reading a run ------------------------------------------------------------------------------------------------------------
+# Reading a run --------------------------------------------------------------------------------------------------------
 
 
 def read_run(path: Path) -> pd.DataFrame:

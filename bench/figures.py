@@ -20,10 +20,12 @@ from latticebench.systems.terms import Term
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 FIGURES = ("coefficients", "errors", "error-against-seconds", "error-against-noise", "cost")
 COLOURS = ("tab:blue", "tab:red", "tab:green", "goldenrod", "tab:purple", "tab:cyan", "tab:brown", "tab:pink")
 MARKERS = "os^Dv<>Ph*Xp"
+BOUND = "Cramer-Rao bound, all terms kept"
 # Errors of round-off size share the lowest place of an axis.
 LOWEST = 1e-12
 # An equation that is ten times off is as wrong as any.
@@ -35,7 +37,7 @@ MOST_NAMES = 14
 def draw_all(
     results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = FIGURES
 ) -> list[Path]:
-    """Draw every figure that the results allow, or those of some kinds, and give the files.
+    """Draw every figure that the results allow, or those of some kinds, and return the files.
 
     Raises:
         InputError: a file cannot be written.
@@ -60,7 +62,7 @@ def draw_all(
 def panels(results: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
     """Group results by what was fitted: those of one group share their samples and library.
 
-    Only groups in which a method kept its history are given, each under a name for its file.
+    Only groups in which a method kept its history are returned, each under a name for its file.
     """
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for result in results:
@@ -137,7 +139,7 @@ def _with_error(label: str, result: Mapping[str, Any]) -> str:
 
 
 def errors(table: pd.DataFrame) -> Figure:
-    """Draw the median E2 by system and method: one row for data and library, one mark a method."""
+    """Draw the median E2 by system and method: one row per data and library, one mark per method."""
     short = summary(table)
     short = short[short["e2"].notna()]
     rows = list(dict.fromkeys(zip(short["data"], short["library"], strict=True)))
@@ -165,13 +167,14 @@ def errors(table: pd.DataFrame) -> Figure:
 
 
 def error_against_seconds(table: pd.DataFrame) -> Figure:
-    """Draw E2 against the processor time of the fit (one thread), one mark a case, one colour a method."""
+    """Draw E2 against the processor time of the fit (one thread), one mark per case, one colour per method."""
     good = table[(table["status"] == "ok") & table["e2"].notna()]
     figure, axes = _axes(6.5, 4.2)
     for k, method in enumerate(dict.fromkeys(good["method"])):
         chosen = good[good["method"] == method]
         axes.plot(
-            np.maximum(chosen["cpu_seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)], color=f"C{k % 10}",
+            np.maximum(chosen["cpu_seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)],
+            color=f"C{k % 10}",
             label=method, ms=6, alpha=0.75,
         )  # fmt: skip
     axes.set_xscale("log")
@@ -184,9 +187,9 @@ def error_against_seconds(table: pd.DataFrame) -> Figure:
 
 
 def cost(table: pd.DataFrame) -> Figure:
-    """Draw E2 against the processor seconds of the fit, one panel for each noise level (down) of each system and library (across).
+    """Draw E2 against the processor seconds of the fit, one panel per noise level (down), system and library (across).
 
-    Only systems and libraries that were run at several noise levels are drawn; one mark a case.
+    Only systems and libraries that were run at several noise levels are drawn; one mark per case.
     """
     import matplotlib.pyplot as plt
 
@@ -204,7 +207,8 @@ def cost(table: pd.DataFrame) -> Figure:
             here = (good["system"] == system) & (good["library"] == library) & (good["noise"] == noise)
             chosen = good[here & (good["method"] == method)]
             axes.plot(
-                np.maximum(chosen["cpu_seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)], color=f"C{k % 10}",
+                np.maximum(chosen["cpu_seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)],
+            color=f"C{k % 10}",
                 ms=5, alpha=0.75, label=method,
             )  # fmt: skip
         axes.set_xscale("log")
@@ -225,10 +229,11 @@ def _by_noise(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def error_against_noise(table: pd.DataFrame) -> Figure:
-    """Draw E2 against the noise level, one line a method, one panel for system and library.
+    """Draw E2 against the noise level, one line per method, one panel per system and library.
 
-    A line is the median over the seeds, the bar at it holds their middle 80 %, and the dashed line is the Cramer-Rao bound.
-    With two noise levels or more, the noise-free cases are left to the tables: their errors are of another order.
+    A line is the median over the seeds, the bar at it holds their middle 80 %, and the dashed line is the Cramer-Rao
+    bound. With two noise levels or more, the noise-free cases are left to the tables: their errors are of another
+    order.
     """
     import matplotlib.pyplot as plt
     from matplotlib.ticker import NullLocator
@@ -243,31 +248,17 @@ def error_against_noise(table: pd.DataFrame) -> Figure:
     across = 4 if len(panels) % 4 == 0 else min(len(panels), 3)
     down = -(-len(panels) // across)
     figure, grid = plt.subplots(
-        down, across, figsize=(3.4 * across + 1.6, 3.3 * down), squeeze=False, layout="constrained", sharex=True, sharey=True
+        down, across, figsize=(3.4 * across + 1.6, 3.3 * down), squeeze=False, layout="constrained",
+        sharex=True, sharey=True,
     )  # fmt: skip
     methods = list(dict.fromkeys(known["method"]))
-    lines: dict[str, Any] = {}
-    bound: list[Any] = []
+    handles: dict[str, Line2D] = {}
     for axes, (system, library) in zip(grid.flat, panels, strict=False):
         here = known[(known["system"] == system) & (known["library"] == library)]
-        for k, method in enumerate(methods):
-            by_noise = here[here["method"] == method].groupby("noise")["e2"]
-            low, middle, high = (by_noise.quantile(share, interpolation="nearest") for share in (0.1, 0.5, 0.9))
-            if middle.empty:
-                continue
-            # A little beside each other, since the best methods lie on one line.
-            at = middle.index * (1.0 if alone else 10 ** (0.014 * (k - (len(methods) - 1) / 2)))
-            colour = f"C{k % 10}"
-            axes.vlines(at, _bounded(low), np.minimum(high, HIGHEST), color=colour, alpha=0.35, lw=2.2)
-            style = f"-{MARKERS[k % len(MARKERS)]}"
-            (line,) = axes.plot(at, _bounded(middle), style, color=colour, label=method, ms=3.5, lw=0.9)
-            lines.setdefault(method, line)
-        floor = here.groupby("noise")["bound"].max().dropna()
-        if len(floor) > 1:
-            (line,) = axes.plot(
-                floor.index, floor, "--", color="black", lw=1.5, zorder=5, label="Cramer-Rao bound, all terms kept"
-            )
-            bound = [line]
+        # A little beside each other, since the best methods lie on one line.
+        apart = 0.0 if alone else 0.014
+        for label, line in _noise_curves(axes, here, methods, apart).items():
+            handles.setdefault(label, line)
         if alone:
             axes.set_xscale("symlog", linthresh=noisy["noise"].min())
         else:
@@ -278,21 +269,55 @@ def error_against_noise(table: pd.DataFrame) -> Figure:
         axes.set_yscale("log")
         axes.set_title(f"{system}, {library}".replace(_shared([one for one, _ in panels]), ""), fontsize=9)
         axes.grid(alpha=0.25)
-    seen = known["e2"].replace(np.inf, np.nan)
-    least = min(
-        seen.groupby([known["system"], known["library"], known["method"], known["noise"]]).median().min(), HIGHEST
-    )
-    grid[0][0].set_ylim(max(min(least, known["bound"].min()) / 2 if not alone else least / 2, LOWEST / 2), HIGHEST)
+    grid[0][0].set_ylim(_lowest(known, alone), HIGHEST)
     for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
     figure.supxlabel("noise level: sigma over the RMS of the field", fontsize=9)
     figure.supylabel("E2 (median over seeds, with the middle 80 %)", fontsize=9)
-    figure.legend(handles=[*lines.values(), *bound], fontsize=8, loc="outside right center", frameon=False)
+    ordered = sorted(handles.items(), key=lambda item: item[0] == BOUND)
+    figure.legend(handles=[line for _, line in ordered], fontsize=8, loc="outside right center", frameon=False)
     return figure
 
 
+def _noise_curves(axes: Axes, here: pd.DataFrame, methods: Sequence[str], apart: float) -> dict[str, Line2D]:
+    """Draw one panel of `error_against_noise`.
+
+    Args:
+        axes: of the panel.
+        here: its cases.
+        methods: of all panels, in the order of their colours.
+        apart: how far neighbouring methods are moved apart, in decades of the noise.
+
+    Returns:
+        one line per method, and the bound where there are several levels of it.
+    """
+    drawn = {}
+    for k, method in enumerate(methods):
+        by_noise = here[here["method"] == method].groupby("noise")["e2"]
+        low, middle, high = (by_noise.quantile(share, interpolation="nearest") for share in (0.1, 0.5, 0.9))
+        if middle.empty:
+            continue
+        at = middle.index * 10 ** (apart * (k - (len(methods) - 1) / 2))
+        colour = f"C{k % 10}"
+        axes.vlines(at, _bounded(low), np.minimum(high, HIGHEST), color=colour, alpha=0.35, lw=2.2)
+        style = f"-{MARKERS[k % len(MARKERS)]}"
+        (drawn[method],) = axes.plot(at, _bounded(middle), style, color=colour, label=method, ms=3.5, lw=0.9)
+    floor = here.groupby("noise")["bound"].max().dropna()
+    if len(floor) > 1:
+        (drawn[BOUND],) = axes.plot(floor.index, floor, "--", color="black", lw=1.5, zorder=5, label=BOUND)
+    return drawn
+
+
+def _lowest(known: pd.DataFrame, alone: bool) -> float:
+    """Return the lower end of the axis of errors: below every median, and below the bound where it is drawn."""
+    seen = known["e2"].replace(np.inf, np.nan)
+    medians = seen.groupby([known["system"], known["library"], known["method"], known["noise"]]).median()
+    least = min(medians.min(), HIGHEST)
+    return float(max((least if alone else min(least, known["bound"].min())) / 2, LOWEST / 2))
+
+
 def _shared(texts: Sequence[str]) -> str:
-    """Give the words that all texts end with, which a title need not repeat."""
+    """Return the words that all texts end with, which a title need not repeat."""
     words = [text.split() for text in texts]
     count = 0
     while all(len(one) > count + 1 and one[-1 - count] == words[0][-1 - count] for one in words):

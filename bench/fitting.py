@@ -2,8 +2,8 @@
 
     case -> samples -> method -> scores
 
-Samples depend on the seed and on what is observed, never on the method, so that all methods see the same ones; the method draws
-from a stream of its own.
+Samples depend on the seed and on what is observed, never on the method, so that all methods see the same ones; the
+method draws from a stream of its own.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def described(case: Mapping[str, Any]) -> str:
 
 
 def _floor(case: FitCase, base: Path) -> dict[str, Any]:
-    """Give E2 at the Cramer-Rao bound, the smallest standard error of each coefficient, and a verdict on it.
+    """Return E2 at the Cramer-Rao bound, the smallest standard error of each coefficient, and a verdict on it.
 
     Empty without noise, and where it would take too long.
     """
@@ -195,19 +195,15 @@ def _floor(case: FitCase, base: Path) -> dict[str, Any]:
 
 
 def bound(case: FitCase, base: Path) -> Limit:
-    """Give the Cramer-Rao bound for a case's samples and library.
+    """Return the Cramer-Rao bound for a case's samples and library.
 
     Raises:
         InputError: there is no noise, the equation is outside the library, or something is unsound.
     """
     # The noise scales the bound, and its seed matters only where it chooses what is seen.
     seed = case.seed if case.uneven or case.missing > 0 or case.trajectories > 1 else 0
-    alike = case.model_copy(
-        update={
-            "noise": 1.0, "seed": seed, "mirror": False, "label": "", "method": "", "settings": {}, "part": "",
-            "time_limit": 1.0, "memory_limit": 1,
-        }
-    )  # fmt: skip
+    counts = {name: getattr(case, name) for name in ("library", "terms", "missing", "velocities", "known_ends")}
+    alike = case.model_copy(update={**UNSEEN, **counts, "noise": 1.0, "seed": seed})
     return _bound(alike.model_dump_json(), _stamp(case.system, base), base).at(case.noise)
 
 
@@ -224,13 +220,19 @@ def seed_of(base: int, *parts: str) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
 
+# Settings without a part in a simulation, with the values that stand for all others.
+UNSEEN: dict[str, Any] = {
+    "part": "", "library": "", "terms": (), "label": "", "method": "", "settings": {}, "time_limit": 1.0,
+    "memory_limit": 1, "noise": 0.0, "missing": 0.0, "velocities": True, "mirror": False, "known_ends": False,
+}  # fmt: skip
+
+
 def samples(case: FitCase, base: Path) -> list[SimulatedSamples]:
     """Make a case's samples; they do not depend on its library or method."""
-    clean = _simulated(
-        case.system, _stamp(case.system, base), tuple(case.parameters.items()), case.initial, case.sites, case.ends,
-        case.integrator, case.samples, case.span, case.uneven, case.trajectories,
-        case.seed if case.uneven or case.trajectories > 1 else 0, base,
-    )  # fmt: skip
+    # The seed of the noise is no part of a simulation.
+    seed = case.seed if case.uneven or case.trajectories > 1 else 0
+    alike = case.model_copy(update={**UNSEEN, "seed": seed})
+    clean = _simulated(alike.model_dump_json(), _stamp(case.system, base), base)
     draw = np.random.default_rng(seed_of(case.seed, "noise"))
     noisy = [observe(one, draw, noise=case.noise, missing=case.missing, velocities=case.velocities) for one in clean]
     if case.known_ends:
@@ -245,39 +247,19 @@ def _stamp(system: str, base: Path) -> int:
 
 
 @functools.lru_cache(maxsize=16)
-def _simulated(
-    name: str,
-    stamp: int,  # noqa: ARG001
-    parameters: tuple[tuple[str, float], ...],
-    initial: str | None,
-    sites: int | None,
-    ends: Any,
-    integrator: Any,
-    count: int,
-    span: float,
-    uneven: bool,
-    trajectories: int,
-    seed: int,
-    base: Path,
-) -> list[SimulatedSamples]:
-    system = systems.find(name, base)
+def _simulated(text: str, stamp: int, base: Path) -> list[SimulatedSamples]:  # noqa: ARG001
+    case = FitCase.model_validate_json(text)
+    system = systems.find(case.system, base)
     made = []
-    for trajectory in range(trajectories):
-        draw = np.random.default_rng(seed_of(seed, "times", str(trajectory)))
-        vary = np.random.default_rng(seed_of(seed, "initial", str(trajectory))) if trajectory else None
-        times = sample_times(count, span, draw if uneven else None)
-        made.append(
-            simulate(
-                system,
-                parameters=dict(parameters),
-                sites=sites,
-                times=times,
-                ends=ends,
-                initial=initial,
-                variation=vary,
-                integrator=integrator,
-            )
-        )
+    for trajectory in range(case.trajectories):
+        draw = np.random.default_rng(seed_of(case.seed, "times", str(trajectory)))
+        vary = np.random.default_rng(seed_of(case.seed, "initial", str(trajectory))) if trajectory else None
+        one = simulate(
+            system, parameters=case.parameters, sites=case.sites,
+            times=sample_times(case.samples, case.span, draw if case.uneven else None),
+            ends=case.ends, initial=case.initial, variation=vary, integrator=case.integrator,
+        )  # fmt: skip
+        made.append(one)
     return made
 
 
@@ -293,7 +275,7 @@ def exact_regression(data: list[SimulatedSamples], candidates: Library) -> Regre
 
 
 def conditioning(regression: Regression) -> float:
-    """Give the ratio of the largest to the smallest singular value of the columns, each scaled to length 1."""
+    """Return the ratio of the largest to the smallest singular value of the columns, each scaled to length 1."""
     values = np.linalg.svd(regression.design / regression.scales, compute_uv=False)
     return float(values[0] / values[-1]) if values[-1] > 0 else math.inf
 

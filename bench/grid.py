@@ -25,7 +25,7 @@ class Contestant(Settings):
 
 
 class Grid(Settings):
-    """A block of a suite: every list is an axis. The keys are those of `FitCase`, in the plural where a list is usual."""
+    """A block of a suite: every list is an axis. The keys are those of `FitCase`, some of them in the plural."""
 
     part: str = ""
     system: str

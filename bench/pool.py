@@ -1,7 +1,7 @@
 """The pool of worker processes.
 
-Each slot of the pool is a loky executor with one worker, so that a worker that hangs, eats memory or dies takes no other case
-with it. A worker runs one thread, lives for many cases, and ends when the runner does, however that ends.
+Each slot of the pool is a loky executor with one worker, so that a worker that hangs, eats memory or dies takes no
+other case with it. A worker runs one thread, lives for many cases, and ends when the runner does, however that ends.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any
 
 from latticebench.bench.case import Case, Folders
-from latticebench.bench.worker import attempt, follow_runner, outcome, too_much
+from latticebench.bench.worker import attempt, follow_runner, outcome, ready, too_much
 
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
@@ -36,8 +36,8 @@ def execute(
 ) -> None:
     """Run cases on `jobs` workers.
 
-    A case beyond its time or memory limit has its worker killed; its result says so. On any exception (Ctrl-C among them) all
-    workers are killed before it is passed on.
+    A case beyond its time or memory limit has its worker killed; its result says so. On any exception (Ctrl-C among
+    them) all workers are killed before it is passed on.
 
     Args:
         cases: in the order in which they begin.
@@ -96,7 +96,7 @@ class _Slot:
         self.case, self.number, self.since = case, number, time.monotonic()
         try:
             if not self.worker:
-                self.worker = self.executor.submit(os.getpid).result(timeout=START_LIMIT)
+                self.worker = self.executor.submit(ready, type(case)).result(timeout=START_LIMIT)
                 self.since = time.monotonic()
             self.future = self.executor.submit(attempt, case, folders)
         except (RuntimeError, OSError, TimeoutError) as error:

@@ -55,7 +55,7 @@ def _ranges(numbers: Sequence[int]) -> list[int | str]:
 
 
 def commit() -> str:
-    """Name the commit of the source tree, with "+changes" where files differ from it; "release" outside a repository."""
+    """Return the commit of the source tree, with "+changes" where files differ; "release" outside a repository."""
     folder = Path(__file__).resolve().parent
     try:
         # The package may be installed inside somebody else's repository: only a tree that tracks this file counts.

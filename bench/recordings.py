@@ -1,7 +1,7 @@
 """Measured recordings that the loop is tried on: what they are, who made them, and how to know a true copy.
 
-None of them is part of this project, whose licence is not theirs. A user who has one takes a local copy of it; its SHA-256 says
-that it is the one that the published results are of.
+None of them is part of this project, whose licence is not theirs. A user who has one takes a local copy of it; its
+SHA-256 says that it is the one that the published results are of.
 """
 
 from __future__ import annotations
@@ -49,17 +49,18 @@ PENDULUM = "Kaheman et al., arXiv:2205.06231; repository dynamicslab/MultiArm-Pe
 RECORDINGS: tuple[Recording, ...] = (
     Recording(
         "gliders",
-        "two gliders on an air track, with springs between them and to both walls, filmed; positions in whole pixels, each counted "
-        "from a starting point of its own",
+        "two gliders on an air track, with springs between them and to both walls, filmed; positions in whole pixels, "
+        "each counted from a starting point of its own",
         "t,u1,u2", 495, "30 Hz (steps of 0.033 or 0.034 s)",
-        "Schmidt & Lipson, Science 324, 81 (2009), real_double_linear_h_1.txt, as kept in erwincoumans/tiny-differentiable-simulator",
+        "Schmidt & Lipson, Science 324, 81 (2009), real_double_linear_h_1.txt, as kept in "
+        "erwincoumans/tiny-differentiable-simulator",
         "none stated for the data; the repository that keeps it is Apache-2.0",
         "ee6b1b9d9e27e0e2204fe3f96bb16cd80db6fc7c00be6a6e5d51c30dfc9c9cc1",
     ),
     Recording(
         "pendulum",
-        "one physical pendulum that swings freely from 1.62 down to 0.26 rad; angle from rest in rad, read by an optical encoder in "
-        "steps of 2 pi / 40000",
+        "one physical pendulum that swings freely from 1.62 down to 0.26 rad; angle from rest in rad, read by an "
+        "optical encoder in steps of 2 pi / 40000",
         "t,u1", 55001, "1 kHz", PENDULUM, "MIT",
         "5fd3a6b6b8aaadae813af8dc57bd179361dd7bd11fab959ac74c2bc4c1cb5898",
     ),
@@ -71,8 +72,8 @@ RECORDINGS: tuple[Recording, ...] = (
     ),
     Recording(
         "silverbox",
-        "an electronic circuit that behaves much like a Duffing oscillator (u1, V), driven by a known voltage (f1, V), both without their "
-        "means: first noise of growing size, then ten multisine blocks with pauses",
+        "an electronic circuit that behaves much like a Duffing oscillator (u1, V), driven by a known voltage (f1, V), "
+        "both without their means: first noise of growing size, then ten multisine blocks with pauses",
         "t,u1,f1", 131072, "610.3515625 Hz",
         "Wigren & Schoukens, European Control Conference 2013, as kept in the history of antonior92/sysid-neuralnet",
         "free to download; no licence stated",
@@ -131,8 +132,8 @@ def take(name: str, origin: Path, place: Path | None = None) -> tuple[Path, bool
     found = fingerprint(origin)
     if found != recording.sha256:
         raise InputError(
-            f"{origin}: its SHA-256 is {found}, that of {name!r} is {recording.sha256}; this is another file, or the same data in another "
-            f"form than {recording.rows} rows of {recording.columns}"
+            f"{origin}: its SHA-256 is {found}, that of {name!r} is {recording.sha256}; this is another file, or the "
+            f"same data in another form than {recording.rows} rows of {recording.columns}"
         )
     if place.exists():
         if fingerprint(place) == found:

@@ -95,11 +95,14 @@ def run(
 
     if waiting:
         execute(waiting, suite.folders, jobs=jobs, begin=begin, keep=keep)
-    # The same case under another label or limit.
-    texts = {key: text for key, (_, text) in (store.finished() if waiting else before).items()}
-    store.relabel({key: case for key, case in wanted.items() if key in texts and texts[key] != case.model_dump_json()})
+    store.relabel(_renamed(wanted, store.finished() if waiting else before))
     tally.statuses = store.statuses(shard)
     return store.results(shard), tally
+
+
+def _renamed(cases: Mapping[str, Case], finished: Mapping[str, tuple[str, str]]) -> dict[str, Case]:
+    """Return the cases whose result is stored under another label or limit."""
+    return {key: one for key, one in cases.items() if key in finished and finished[key][1] != one.model_dump_json()}
 
 
 def _counts(case: Case, status: str, text: str, retry: bool) -> bool:

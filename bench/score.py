@@ -5,9 +5,10 @@ With xi* the true and xi the found coefficients over the library:
     E2       |xi - xi*| / |xi*|
     Einf     max over the true terms |xi_j - xi*_j| / |xi*_j|
     spurious max |xi_j| over the absent terms (in units of the derivative over those of the term)
-    support  TPR = TP / (TP + FP + FN); a term is found when its share |xi_j| RMS(T_j) reaches PRESENT times the RMS of the
-             derivative, both on the noise-free samples: one threshold for every method
-    forecast relative L2 error of a simulation from an initial state that no method saw, and the time until it exceeds 0.1
+    support  TPR = TP / (TP + FP + FN); a term is found when its share |xi_j| RMS(T_j) reaches PRESENT times the RMS of
+             the derivative, both on the noise-free samples: one threshold for every method
+    forecast relative L2 error of a simulation from an initial state that no method saw, and the time until it exceeds
+             0.1
 """
 
 from __future__ import annotations

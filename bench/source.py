@@ -1,7 +1,7 @@
 """The key under which a result is stored: a hash of the case and of the code that decides its result.
 
-A changed method, engine or system is run again, an unchanged one is not; comments, docstrings, layout, and every module that the
-computation does not import (pages, tables, the runner, the command line) do not count.
+A changed method, engine or system is run again, an unchanged one is not; comments, docstrings, layout, and every
+module that the computation does not import (pages, tables, the runner, the command line) do not count.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def keys(cases: Mapping[str, Case], folders: Folders) -> dict[str, str]:
 
 
 def fingerprint(roots: Roots, folders: Folders) -> str:
-    """Hash all that a result is computed from: modules without their comments and docstrings, other files as they are."""
+    """Hash all that a result is computed from: code without its comments and docstrings, other files as they are."""
     digests = sorted(_digest(path, path.stat().st_mtime_ns) for path in files(roots, folders))
     return hashlib.sha256("".join(digests).encode()).hexdigest()
 

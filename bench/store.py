@@ -5,8 +5,9 @@
     suite    the keys of the suite that was run last, in their order
     about    what else was written down of that run: command, settings
 
-Each result is committed at once, in a transaction of its own, so that a killed run loses nothing that it had reported, and two runs
-at once harm nothing. The history of a fit, which is most of a result, is read only where it is asked for.
+Each result is committed at once, in a transaction of its own, so that a killed run loses nothing that it had
+reported, and two runs at once harm nothing. The history of a fit, which is most of a result, is read only where it is
+asked for.
 """
 
 from __future__ import annotations
@@ -106,8 +107,8 @@ class Store:
         """
         rows = [(place, key, identity) for place, (identity, key) in enumerate(keys.items())]
         with self._writing() as cursor:
-            # In this connection it hides the table of the file: a run goes by its own plan, whatever another run on the same
-            # store plans meanwhile.
+            # In this connection it hides the table of the file: a run goes by its own plan, whatever another run on
+            # the same store plans meanwhile.
             cursor.execute(
                 "CREATE TEMP TABLE IF NOT EXISTS suite (place INTEGER PRIMARY KEY, key TEXT UNIQUE, identity TEXT)"
             )
@@ -167,7 +168,7 @@ class Store:
         return {name: json.loads(value) for name, value in self.read("SELECT name, value FROM about ORDER BY name")}
 
     def origins(self) -> list[dict[str, Any]]:
-        """Return what made the results of the suite that was run last: commit, date, machine and versions, each once."""
+        """Return the commits, dates, machines and versions that made the results of the suite that was run last."""
         used = "SELECT DISTINCT origin FROM suite JOIN results USING (key)"
         return [json.loads(text) for (text,) in self.read(f"SELECT origin FROM origins WHERE number IN ({used})")]
 
@@ -278,7 +279,8 @@ def open_store(folder: Path) -> Store:
     path = folder / FILE
     if not path.is_file():
         raise InputError(
-            f"{folder}: not a store of results (no {FILE} in it); make one with: latticebench run SUITE --results {folder}"
+            f"{folder}: not a store of results (no {FILE} in it); "
+            f"make one with: latticebench run SUITE --results {folder}"
         )
     try:
         return Store(path, _connect(path, "rw"))
@@ -310,7 +312,7 @@ def _connect(path: Path, mode: str, *, fresh: bool = False) -> sqlite3.Connectio
 
 
 def _keep_journal(connection: sqlite3.Connection) -> None:
-    """Let readers and a writer not wait for each other; where the file system cannot, SQLite's rollback journal stays."""
+    """Spare readers and a writer waiting for each other; a rollback journal stands in where the file system cannot."""
     try:
         connection.execute("PRAGMA journal_mode = WAL")
     except sqlite3.OperationalError:

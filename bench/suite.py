@@ -26,12 +26,14 @@
     terms = "u[n+1]+u[n-1]-2*u[n]; u[n]"
     order = 2
 
-A suite may have blocks of all three kinds. Paths are relative to the suite file, those of recordings to the folder of recordings.
+A suite may have blocks of all three kinds. Paths are relative to the suite file, those of recordings to the folder of
+recordings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -133,19 +135,19 @@ def _fits(file: _File, shown: str) -> Iterator[Case]:
     for number, block in enumerate(file.grid, start=1):
         where = f"{shown}: grid {number}"
         grid = _checked(Grid, {**file.defaults, **block}, where)
-        try:
+        with _told(where, FitCase):
             yield from grid.cases(file.methods, where)
-        except pydantic.ValidationError as error:
-            raise _unsound(where, error, FitCase) from None
 
 
 def _trials(file: _File, shown: str) -> Iterator[Case]:
     if file.made:
-        from latticebench.bench.trials.trial import Made
+        from latticebench.bench.trials.trial import Made, Trial
 
         for number, block in enumerate(file.made, start=1):
             where = f"{shown}: made {number}"
-            yield from _checked(Made, block, where).cases(where)
+            made = _checked(Made, block, where)
+            with _told(where, Trial):
+                yield from made.cases(where)
 
 
 def _recordings(file: _File, shown: str) -> Iterator[Case]:
@@ -178,8 +180,14 @@ Model = TypeVar("Model", bound=Settings)
 
 
 def _checked(model: type[Model], content: Mapping[str, Any], where: str) -> Model:
-    try:
+    with _told(where, model):
         return model.model_validate(content)
+
+
+@contextmanager
+def _told(where: str, model: type[Settings]) -> Iterator[None]:
+    try:
+        yield
     except pydantic.ValidationError as error:
         raise _unsound(where, error, model) from None
 

@@ -28,10 +28,12 @@ ABOUT = ["part", "data", "library"]
 
 # Columns of the tables; those that a program reads are the last.
 CASES = (
-    "part", "data", "library", "method", "noise", "seed", "status", *SCORES, "covered", "reason", "settings", "identity",
+    "part", "data", "library", "method", "noise", "seed", "status", *SCORES, "covered", "reason", "settings",
+    "identity",
 )  # fmt: skip
 COEFFICIENTS = (
-    "part", "data", "library", "method", "noise", "seed", "term", "coefficient", "truth", "error", "stderr", "bound", "verdict",
+    "part", "data", "library", "method", "noise", "seed", "term", "coefficient", "truth", "error", "stderr", "bound",
+    "verdict",
 )  # fmt: skip
 LIMITS = (*ABOUT, "term", "truth", "bound", "verdict")
 
@@ -66,7 +68,8 @@ def cases(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 def coefficients(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Make the table of coefficients: one row each, with truth and error where there are any.
 
-    `bound` is the smallest standard error that an unbiased method can have on these samples, `verdict` what follows from it.
+    `bound` is the smallest standard error that an unbiased method can have on these samples, `verdict` what follows
+    from it.
     """
     return tables(results)["coefficients"]
 
@@ -123,11 +126,12 @@ def _covered(result: Mapping[str, Any]) -> float:
 def summary(table: pd.DataFrame) -> pd.DataFrame:
     """Sum the table of cases up over seeds: one row for data, library and method.
 
-    A case that failed or ran out of time counts as an infinite error and stays in the median; one that was skipped leaves no
-    figure. `ok` counts the cases that ended with a fit. `efficiency` is the Cramer-Rao bound over the root-mean-square of E2
-    over the seeds: 1 is the best that an unbiased method can do, a failure makes it 0, and with fewer than FEW seeds it is left
-    out; a biased method may pass 1 where the samples say little, since 0 for every coefficient is never more than 100 % off.
-    `coverage` is the share of the 95 % intervals (1.96 standard errors to each side) that hold the truth.
+    A case that failed or ran out of time counts as an infinite error and stays in the median; one that was skipped
+    leaves no figure. `ok` counts the cases that ended with a fit. `efficiency` is the Cramer-Rao bound over the
+    root-mean-square of E2 over the seeds: 1 is the best that an unbiased method can do, a failure makes it 0, and
+    with fewer than FEW seeds it is left out; a biased method may pass 1 where the samples say little, since 0 for
+    every coefficient is never more than 100 % off. `coverage` is the share of the 95 % intervals (1.96 standard
+    errors to each side) that hold the truth.
     """
     if table.empty:
         return pd.DataFrame(columns=[*ABOUT, "method"])

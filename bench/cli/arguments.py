@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -110,14 +110,3 @@ def told(data: Sequence[Samples], method: str | None, what: str) -> Iterator[Non
         raise
     except Exception as error:
         raise InputError(f"{data[0].source}: {what} failed: {type(error).__name__}: {error}") from error
-
-
-def jsonable(value: Any) -> Any:
-    """Put None for NaN and texts for infinities, which JSON does not have."""
-    if isinstance(value, Mapping):
-        return {key: jsonable(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [jsonable(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else ("inf" if value > 0 else "-inf")
-    return value

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
-
-from latticebench.bench.cli.arguments import jsonable
 
 EPILOG = "Example:  latticebench compare results/default runs/default"
 
@@ -19,15 +16,16 @@ def compare(
     factor: Annotated[float, typer.Option(min=1.0, help="An error that grew beyond this factor is a loss.")] = 2.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
 ) -> None:
-    """Say which cases got better or worse; exit code 1 when any got worse."""
+    """Compare two runs case by case; exit code 1 when any case got worse."""
     from latticebench.bench.compare import compare as compare_runs
     from latticebench.bench.compare import read_run
 
     found = compare_runs(read_run(old), read_run(new), factor)
     if as_json:
-        rows = {"worse": found.worse.to_dict("records"), "better": found.better.to_dict("records")}
-        rest = {"same": found.same, "gone": found.gone, "new": found.fresh}
-        print(json.dumps({**jsonable(rows), **rest}, indent=2))
+        from latticebench.bench.report.document import provenance, to_json
+        from latticebench.bench.report.outputs import compare_document
+
+        print(to_json(compare_document(found, provenance())), end="")
     else:
         for name, frame in (("worse", found.worse), ("better", found.better)):
             for _, row in frame.iterrows():
@@ -37,7 +35,8 @@ def compare(
         for name in found.fresh:
             print(f"new: {name}")
         print(
-            f"{len(found.worse)} worse, {len(found.better)} better, {found.same} the same (within a factor of {factor:g})"
+            f"{len(found.worse)} worse, {len(found.better)} better, {found.same} the same "
+            f"(within a factor of {factor:g})"
         )
     if len(found.worse):
         raise typer.Exit(1)

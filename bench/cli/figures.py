@@ -17,7 +17,7 @@ def figures(
         list[str] | None, typer.Option(help="Draw this kind of figure alone; may be given several times.")
     ] = None,
 ) -> None:
-    """Draw the results of a run: coefficients against iteration, errors against time and noise; what was named for what."""
+    """Draw the results of a run: coefficients by iteration, errors by time and noise, effects by what was named."""
     from latticebench.bench import kinds
     from latticebench.bench.store import open_store
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated, Any, Literal
 
 import typer
@@ -18,7 +17,7 @@ def list_(
     kind: Annotated[Kind, typer.Argument(help="What to list.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
 ) -> None:
-    """Say what there is."""
+    """List what there is."""
     from latticebench.bench.screen import show_rows
 
     makers = {
@@ -27,7 +26,10 @@ def list_(
     }  # fmt: skip
     rows = makers[kind]()
     if as_json:
-        print(json.dumps(rows, indent=2))
+        from latticebench.bench.report.document import provenance, to_json
+        from latticebench.bench.report.outputs import ListDocument
+
+        print(to_json(ListDocument(provenance=provenance(), kind=kind, rows=rows)), end="")
         return
     show_rows(list(rows[0]), [list(row.values()) for row in rows])
 
@@ -69,10 +71,13 @@ def _method_rows() -> list[dict[str, Any]]:
     from latticebench import methods
     from latticebench.methods.method import settings
 
-    return [
-        {"name": name, "what it is": (kind.__doc__ or "").strip().splitlines()[0], "settings": settings(kind)}
-        for name, kind in methods.registered().items()
-    ]
+    rows = []
+    for name, kind in methods.registered().items():
+        # JSON has lists alone.
+        values = {key: list(value) if isinstance(value, tuple) else value for key, value in settings(kind).items()}
+        about = (kind.__doc__ or "").strip().splitlines()[0]
+        rows.append({"name": name, "what it is": about, "settings": values})
+    return rows
 
 
 def _effect_rows() -> list[dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
@@ -12,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import jsonable
 from latticebench.bench.cli.options import complete_suites
+from latticebench.bench.cli.table import document
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def run(
         str | None, typer.Option(metavar="K/N", help="Run every N-th case alone, beginning with the K-th.")
     ] = None,
     data: Annotated[Path, typer.Option(help="The folder of measured recordings.")] = Path("data"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the tables of cases as JSON.")] = False,
 ) -> None:
     """Run a suite, continuing where it was stopped, and show its results."""
     from latticebench.bench import kinds
@@ -64,7 +63,7 @@ def run(
         )
         raise
     if as_json:
-        print(json.dumps(jsonable(kinds.rows(store, part)), indent=2))
+        print(document(store, part), end="")
         return
     kinds.show(store, loaded.title, shard=part)
     statuses = ", ".join(f"{count} {status}" for status, count in tally.statuses.items())

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import jsonable
 from latticebench.systems.errors import unknown
+
+if TYPE_CHECKING:
+    from latticebench.bench.store import Shard, Store
 
 EPILOG = "Example:  latticebench table runs/default --out results/default"
 
@@ -22,7 +23,7 @@ def table(
     only: Annotated[
         list[str] | None, typer.Option(help="Publish this table alone; may be given several times.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the table of cases as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the tables of cases as JSON.")] = False,
 ) -> None:
     """Show the results of a run as a table, and publish them."""
     from latticebench.bench import kinds
@@ -34,9 +35,21 @@ def table(
     kinds.check_tables(only)
     store = open_store(folder)
     if as_json:
-        print(json.dumps(jsonable(kinds.rows(store)), indent=2))
+        print(document(store), end="")
     else:
         kinds.show(store, value=value)
     if out is not None:
         for path in kinds.publish(store, out, only):
             print(path, file=sys.stderr if as_json else sys.stdout)
+
+
+def document(store: Store, shard: Shard | None = None) -> str:
+    """Return one row per case as the text of a JSON file, see `bench.report.outputs.RunDocument`."""
+    from latticebench.bench import kinds
+    from latticebench.bench.provenance import describe
+    from latticebench.bench.report.document import to_json
+    from latticebench.bench.report.outputs import run_document
+    from latticebench.bench.store import WHOLE
+
+    about = describe(store.origins(), store.about(), store.seeds())
+    return to_json(run_document(kinds.rows(store, shard or WHOLE), about))

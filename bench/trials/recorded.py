@@ -33,7 +33,7 @@ def table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def summarised(report: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the verdict, the effects that were named, and the errors before and after of a report; None if there is none."""
+    """Return the verdict, the named effects, and the errors before and after of a report; None for each without one."""
     errors = [f"{name}_{when}" for name in ("residual", "forecast") for when in ("before", "after")]
     if report is None:
         return dict.fromkeys(["verdict", "named", *errors])

@@ -24,10 +24,10 @@ FIGURES = ("confusion",)
 SETTINGS = ("system", "effect", "z", "noise", "velocities", "seed")
 COLUMNS = (
     *SETTINGS, "status", "size", "apart", "verdict", "named", "alike", "right", "extra",
-    "residual_before", "residual_after", "forecast_before", "forecast_after", "forecast_true", "coefficients_before", "coefficients_after",
-    "seconds", "cpu_seconds", "message",
+    "residual_before", "residual_after", "forecast_before", "forecast_after", "forecast_true",
+    "coefficients_before", "coefficients_after", "seconds", "cpu_seconds", "message",
 )  # fmt: skip
-# From here on what no single effect of the catalogue can do is visible beside the best one (in units of its standard error).
+# What no single effect of the catalogue can do is visible from this size on, in units of its standard error.
 APART = 5.0
 TRUE_TIMES = 1.5
 
@@ -79,8 +79,8 @@ def summary(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _line(head: dict[str, Any], group: pd.DataFrame) -> dict[str, Any]:
     values = {name: group[name].astype(float).median() for name in (
-        "residual_before", "residual_after", "forecast_before", "forecast_after", "coefficients_before", "coefficients_after",
-        "cpu_seconds",
+        "residual_before", "residual_after", "forecast_before", "forecast_after", "coefficients_before",
+        "coefficients_after", "cpu_seconds",
     )}  # fmt: skip
     return {
         **head, "trials": len(group), "right": float(group["right"].astype(float).mean()),
@@ -89,7 +89,11 @@ def _line(head: dict[str, Any], group: pd.DataFrame) -> dict[str, Any]:
 
 
 def _ahead(group: pd.DataFrame) -> dict[str, float]:
-    """Compare forecasts with those of the true model fitted to the same data: the median ratio, and the share of at most TRUE_TIMES."""
+    """Compare forecasts with those of the true model fitted to the same data.
+
+    Returns:
+        the median of the ratio, and the share of ratios that are at most TRUE_TIMES.
+    """
     ratio = (group["forecast_after"].astype(float) / group["forecast_true"].astype(float)).dropna()
     return {
         "forecast over that of the true model": float(ratio.median()) if len(ratio) else float("nan"),
@@ -98,7 +102,7 @@ def _ahead(group: pd.DataFrame) -> dict[str, float]:
 
 
 def by_effect(frame: pd.DataFrame) -> pd.DataFrame:
-    """Give, for each effect, how often it was named right at each size."""
+    """Return, per effect and size, how often it was named right."""
     ran = frame[(frame["status"] == "ok") & (frame["effect"] != NONE)]
     found = ran.assign(right=ran["right"].astype(float)).pivot_table(
         index="effect", columns="z", values="right", aggfunc=["mean", "count"]

@@ -1,4 +1,4 @@
-"""Trials as cases: a recording made with a known effect is diagnosed, and the diagnosis compared with what was put in."""
+"""Trials as cases: a recording made with a known effect is diagnosed, and the diagnosis judged by what was put in."""
 
 from __future__ import annotations
 
@@ -130,8 +130,8 @@ class Made(Settings):
     """A block of trials in a suite: every combination of the lists is one.
 
     Attributes:
-        effects: names; "a+b" for two at once, "none" for none, "catalogue" for all of the catalogue that make sense in the
-            system, "outside", "blind", "second-blind", ... for faults outside it.
+        effects: names; "a+b" for two at once, "none" for none, "catalogue" for all of the catalogue that make sense in
+            the system, "outside", "blind", "second-blind", ... for faults outside it.
     """
 
     part: str = ""
@@ -189,7 +189,8 @@ def wanted_names(effect: str) -> list[str]:
 def _forecast_of_truth(one: Specimen, found: Diagnosis) -> float | None:
     """Return the error of forecasts by the true model, fitted to the same data; None where it cannot be set up.
 
-    Its effect is put at the place and with the frequency, delay and so on that it was made with; these and its coefficients are then fitted.
+    Its effect is put at the place and with the frequency, delay and so on that it was made with; these and its
+    coefficients are then fitted.
     """
     course = found.course
     before = alike(course.before, course.after)

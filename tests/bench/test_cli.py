@@ -72,7 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("kind", ["systems", "libraries", "methods", "suites", "effects"])
 def test_lists_are_tables_for_people_and_json_for_programs(kind: str, tmp_path: Path) -> None:
-    rows = json.loads(succeed("list", kind, "--json", cwd=tmp_path))
+    rows = json.loads(succeed("list", kind, "--json", cwd=tmp_path))["rows"]
     shown = succeed("list", kind, cwd=tmp_path)
     for row in rows:
         assert str(next(iter(row.values()))) in shown
@@ -174,8 +174,8 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_its_table_its_figures_and_its_comparison(tiny: Path) -> None:
     again = succeed("run", "tiny", "--results", "tiny", cwd=tiny)
     assert "0 run now, 9 were there" in again
-    rows = json.loads(succeed("table", "tiny", "--out", "published", "--json", cwd=tiny))
-    assert len(rows) == 9
+    found = json.loads(succeed("table", "tiny", "--out", "published", "--json", cwd=tiny))
+    assert (len(found["cases"]), found["provenance"]["suite"]) == (9, "tiny")
     for name in ("cases", "coefficients", "summary", "errors"):
         for form in ("csv", "md", "tex"):
             text = (tiny / "published" / f"{name}.{form}").read_text()
@@ -299,6 +299,12 @@ BAD_COMMANDS = {
     "run nothing": "unknown suite",
     "run bad.toml": "unknown key 'sistem'; did you mean 'system'",
     "run tiny --results phi4.csv": "a file, not a folder",
+    "run tiny --shard 0/3": "--shard 0/3: write K/N with K from 1 to N",
+    "run tiny --shard 4/3": "--shard 4/3: write K/N",
+    "run tiny --shard half": "--shard half: write K/N",
+    "run tiny --results json": "a store of version 2 or older",
+    "table json": "a store of version 2 or older",
+    "table damaged": "results.sqlite: not a store of results that can be read",
     "table .": "not a store",
     "figures .": "not a store",
     "compare phi4.csv phi4.csv": "column 'identity' is missing",
@@ -335,6 +341,9 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(command: str, folder: Path)
     (folder / "huge.csv").write_text("t,u1\n" + "".join(f"{k},{(-1) ** k * 1e200}\n" for k in range(20)))
     (folder / "short.csv").write_text("t,u1\n" + "".join(f"{k},{k * k}\n" for k in range(4)))
     (folder / "bad.toml").write_text('[methods.a]\nmethod = "zero"\n[[grid]]\nsistem = "phi4"\nlibraries = ["lib1"]\n')
+    for name, file, content in (("json", "store.json", '{"version": 2}'), ("damaged", "results.sqlite", "x" * 5000)):
+        (folder / name).mkdir(exist_ok=True)
+        (folder / name / file).write_text(content)
     before = sorted(path.name for path in folder.iterdir())
     done = latticebench(*command.split(), cwd=folder)
     assert done.returncode == 2, done.stdout
@@ -367,7 +376,7 @@ def test_a_method_and_a_system_from_outside_work_without_touching_the_project(tm
         'title = "from outside"\n[methods.rounded]\nmethod = "guess.py"\nsettings = { grid = 0.25 }\n'
         '[[grid]]\nsystem = "toda.toml"\nlibraries = ["toda"]\nparameters = { k = [0.5, 1.5] }\nspan = 5\n'
     )
-    rows = json.loads(succeed("run", "mine.toml", "--results", "out", "--json", cwd=tmp_path))
+    rows = json.loads(succeed("run", "mine.toml", "--results", "out", "--json", cwd=tmp_path))["cases"]
     assert [row["e2"] for row in rows] == [0.0, 0.0]
     succeed("simulate", "toda.toml", "--span", 5, "--out", "toda.csv", cwd=tmp_path)
     out = succeed(

@@ -18,8 +18,12 @@ def learned() -> dict[str, object]:
     case = FitCase(system="phi4", library="lib1", label="net", method="net")
     made = {**outcome(case, "ok"), "case": case.model_dump(mode="json"), "identity": case.identity}
     made.update(
-        e2=0.01, seconds=3.0, cpu_seconds=2.9, coefficients={"u[n]": 1.9, "u[n]**3": 0.1}, truth={"u[n]": 2.0, "u[n]**3": 0.0},
-        history={"step": [0, 10, 20], "seconds": [0, 1, 2], "loss": [3, 2, 1], "coefficients": [[0, 0], [1, 0.3], [1.9, 0.1]]},
+        e2=0.01, seconds=3.0, cpu_seconds=2.9, coefficients={"u[n]": 1.9, "u[n]**3": 0.1},
+        truth={"u[n]": 2.0, "u[n]**3": 0.0},
+        history={
+            "step": [0, 10, 20], "seconds": [0, 1, 2], "loss": [3, 2, 1],
+            "coefficients": [[0, 0], [1, 0.3], [1.9, 0.1]],
+        },
     )  # fmt: skip
     return made
 

@@ -264,8 +264,8 @@ def test_a_table_shows_the_suite_that_was_run_last_and_where_each_result_came_fr
 def test_a_noisy_case_holds_its_bound_and_one_without_noise_or_truth_none(tmp_path: Path) -> None:
     def case(**changed: Any) -> FitCase:
         return FitCase(**{
-            "system": "phi4", "sites": 9, "samples": 20, "noise": 0.01, "library": "lib2", "label": "a", "method": "zero",
-            **changed,
+            "system": "phi4", "sites": 9, "samples": 20, "noise": 0.01, "library": "lib2", "label": "a",
+            "method": "zero", **changed,
         })  # fmt: skip
 
     found = attempt(case(known_ends=True), Folders(tmp_path))

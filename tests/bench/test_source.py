@@ -34,7 +34,7 @@ def test_pages_tables_the_runner_the_suite_parser_and_the_command_line_decide_no
     found = files_of(CASES[name].roots)
     others = {
         "suite", "grid", "run", "pool", "worker", "store", "source", "kinds", "tables", "publish", "figures", "compare",
-        "screen", "provenance", "report/page", "report/mathml", "trials/scores", "trials/recorded",
+        "screen", "report/page", "report/mathml", "trials/scores", "trials/recorded",
     }  # fmt: skip
     assert not found & {f"bench/{other}.py" for other in others}
     assert not any(path.startswith("bench/cli/") for path in found)

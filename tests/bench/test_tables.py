@@ -84,7 +84,8 @@ def test_the_efficiency_is_the_bound_over_the_root_mean_square_error_of_the_seed
         if status != "ok":
             return result(method, seed, e2, status)
         return {
-            **result(method, seed, e2, status), "bound": 0.02, "bounds": {"u[n]": 0.02, "abs(u[n])": 0.5}, "verdicts": verdicts
+            **result(method, seed, e2, status), "bound": 0.02, "bounds": {"u[n]": 0.02, "abs(u[n])": 0.5},
+            "verdicts": verdicts,
         }  # fmt: skip
 
     errors = {"a": [0.03, 0.04, 0.0], "b": [0.02, 0.02, None], "c": [0.02, 0.02]}

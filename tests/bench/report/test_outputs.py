@@ -16,7 +16,6 @@ import pytest
 
 from latticebench.bench import cli
 from latticebench.bench.case import Case
-from latticebench.bench.cli.arguments import jsonable
 from latticebench.bench.compare import compare, of_fits
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.provenance import describe, origin
@@ -88,7 +87,6 @@ def test_numbers_that_json_lacks_have_one_rule() -> None:
     text = to_json(Numbers(one=math.nan, more=values))
     found = json.loads(text)
     assert found == {"one": None, "more": {"nan": None, "inf": "inf", "-inf": "-inf", "half": 0.5, "numpy": 2.5}}
-    assert found["more"] == jsonable(values)
     again = Numbers.model_validate_json(text)
     assert math.isnan(again.one)
     assert again.more["-inf"] == -math.inf

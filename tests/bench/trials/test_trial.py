@@ -143,7 +143,10 @@ def test_a_recording_that_changed_is_diagnosed_again(tmp_path: Path) -> None:
 
 def test_the_picture_shows_what_was_named_first_or_of_pairs_alone_all() -> None:
     frame = pd.DataFrame(
-        [("damping+drive", "drive + damping", "explained"), ("damping+drive", "", "unexplained"), ("drive", "drive + kick", "explained")],
+        [
+            ("damping+drive", "drive + damping", "explained"), ("damping+drive", "", "unexplained"),
+            ("drive", "drive + kick", "explained"),
+        ],
         columns=["effect", "named", "verdict"],
     ).assign(status="ok", z=20.0)  # fmt: skip
 

@@ -1,0 +1,91 @@
+"""Large stores: resuming and tabling are quick and small, and nothing of them depends on the number of results."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from latticebench.bench.provenance import origin
+from latticebench.bench.source import keys
+from latticebench.bench.store import create
+from latticebench.bench.suite import load
+from latticebench.bench.worker import attempt
+
+SUITE = """
+title = "many"
+
+[methods.floor]
+method = "zero"
+
+[[grid]]
+system = "phi4"
+sites = 5
+samples = 8
+span = 1.0
+libraries = ["lib1"]
+noise = [0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08, 0.09, 0.1]
+seeds = "1-{seeds}"
+"""
+
+
+def filled(folder: Path, seeds: int) -> None:
+    """Make a store with the results of a suite of ten times as many cases: those of its first case, again and again."""
+    (folder / "many.toml").write_text(SUITE.format(seeds=seeds))
+    suite, store = load(str(folder / "many.toml")), create(folder / "store")
+    key_of = keys(suite.by_identity, suite.folders)
+    store.plan(key_of, {"command": "latticebench run many.toml"})
+    # Written at once, for the disk's sake.
+    store.connection.execute("PRAGMA synchronous = OFF")
+    result, made = attempt(suite.cases[0], suite.folders), origin()
+    for identity, case in suite.by_identity.items():
+        store.put(key_of[identity], case, result, made)
+
+
+def measured(*arguments: str, cwd: Path) -> tuple[str, float, float]:
+    """Run a command; return what it prints, its processor seconds and its peak memory in MiB."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "latticebench", *arguments], cwd=cwd, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        out = process.stdout.read()
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 0
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return out, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / unit
+
+
+posix = pytest.mark.skipif(os.name != "posix", reason="measures as POSIX systems do")
+
+
+@posix
+def test_a_run_of_some_thousand_finished_cases_has_nothing_to_do_and_is_tabled(tmp_path: Path) -> None:
+    filled(tmp_path, 300)
+    out, _, _ = measured("run", "many.toml", "--results", "store", cwd=tmp_path)
+    assert "3000 cases (3000 ok); 0 run now, 3000 were there" in out
+    assert "seeds: 1-300" in out
+    out, _, _ = measured("run", "many.toml", "--results", "store", "--shard", "3/100", cwd=tmp_path)
+    assert "30 cases (30 ok); 0 run now, 30 were there" in out
+    measured("table", "store", "--out", "out", cwd=tmp_path)
+    rows = [line for line in (tmp_path / "out" / "cases.csv").read_text().splitlines() if not line.startswith("#")]
+    assert len(rows) == 3001
+
+
+@posix
+@pytest.mark.slow
+def test_a_hundred_thousand_results_are_resumed_and_tabled_in_seconds_and_in_a_gibibyte(tmp_path: Path) -> None:
+    filled(tmp_path, 10_000)
+    for limit, arguments in (
+        (5.0, ("run", "many.toml", "--results", "store", "--jobs", "1")),
+        (10.0, ("table", "store")),
+        (20.0, ("table", "store", "--out", "out")),
+    ):
+        _, seconds, mebibytes = measured(*arguments, cwd=tmp_path)
+        print(f"{' '.join(arguments)}: {seconds:.1f} s of processor time, {mebibytes:.0f} MiB")
+        # Twice the time that a processor of 2.5 GHz takes when nothing else runs on it.
+        assert seconds <= 2 * limit
+        assert mebibytes <= 1024
