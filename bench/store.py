@@ -39,6 +39,7 @@ CREATE TABLE IF NOT EXISTS results (
     reason TEXT NOT NULL, origin INTEGER NOT NULL REFERENCES origins, content TEXT NOT NULL, history TEXT
 );
 CREATE INDEX IF NOT EXISTS by_identity ON results (identity, key);
+CREATE INDEX IF NOT EXISTS by_key ON results (key, kind, status, origin);
 CREATE TABLE IF NOT EXISTS suite (place INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE);
 CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 """

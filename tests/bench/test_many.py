@@ -70,9 +70,14 @@ def test_a_run_of_some_thousand_finished_cases_has_nothing_to_do_and_is_tabled(t
     assert "seeds: 1-300" in out
     out, _, _ = measured("run", "many.toml", "--results", "store", "--shard", "3/100", cwd=tmp_path)
     assert "30 cases (30 ok); 0 run now, 30 were there" in out
+    suite = tmp_path / "many.toml"
+    suite.write_text(suite.read_text().replace("methods.floor", "methods.ground"))
+    out, _, _ = measured("run", "many.toml", "--results", "store", cwd=tmp_path)
+    assert "0 run now, 3000 were there" in out
     measured("table", "store", "--out", "out", cwd=tmp_path)
     rows = [line for line in (tmp_path / "out" / "cases.csv").read_text().splitlines() if not line.startswith("#")]
     assert len(rows) == 3001
+    assert all(",ground," in row for row in rows[1:])
 
 
 @posix
