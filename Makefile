@@ -13,7 +13,7 @@ bench: $(READY)
 	$(BIN)/latticebench run default --results runs/default
 
 test: $(READY)
-	$(BIN)/python -m pytest -m "not slow" --benchmark-disable -n 2 --dist worksteal
+	$(BIN)/python -m pytest -m "not slow" --benchmark-disable -n 2 --dist loadfile
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow --benchmark-disable -n 2 --dist worksteal

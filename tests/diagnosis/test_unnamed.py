@@ -134,12 +134,17 @@ def test_a_term_that_changes_in_time_and_along_the_chain_is_a_sum_of_products():
     ("system", "effect", "name"),
     [
         ("sine-gordon", "other: stray-wire", "a bond between two distant sites"),
-        ("dnls", "other: stray-wire", "a bond between two distant sites"),
         ("ginzburg-landau", "other: retarded-coupling", "a term that comes late"),
-        ("sine-gordon", "other: shared-inertia", "a term that acts on the neighbours"),
-        ("phi4", "other: shaken-end", "a force at one site that swings at one frequency"),
         ("dnls", "other: pumped-coupling", "a term that swings at one frequency"),
-        ("phi4", "other: unsteady-supply", "a term of any course in time"),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [
+                ("dnls", "other: stray-wire", "a bond between two distant sites"),
+                ("sine-gordon", "other: shared-inertia", "a term that acts on the neighbours"),
+                ("phi4", "other: shaken-end", "a force at one site that swings at one frequency"),
+                ("phi4", "other: unsteady-supply", "a term of any course in time"),
+            ]
+        ),
     ],
 )
 def test_a_bond_or_term_in_an_unusual_place_comes_before_every_name(system, effect, name):
@@ -161,7 +166,8 @@ def test_what_has_no_form_is_found_by_what_it_depends_on(effect, name):
 
 
 @pytest.mark.parametrize(
-    ("name", "effect"), [("sine-gordon", "other: cubic-drag"), ("dnls", "other: drifting-stiffness")]
+    ("name", "effect"),
+    [("sine-gordon", "other: cubic-drag"), pytest.param("dnls", "other: drifting-stiffness", marks=pytest.mark.slow)],
 )
 def test_a_name_that_comes_near_is_not_given_where_a_term_without_one_does_better(name, effect):
     assert effect in OTHERS

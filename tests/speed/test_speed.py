@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from latticebench import methods, systems
+from latticebench.bench.limit import bound
 from latticebench.methods.method import make, solve
 from latticebench.systems.samples import Samples
 from latticebench.systems.simulate import observe, simulate
@@ -40,3 +41,10 @@ def test_a_fit_is_timed(benchmark: Any, name: str, samples: Samples) -> None:
 def test_an_integrator_is_timed(benchmark: Any, integrator: Any) -> None:
     found = benchmark.pedantic(simulate, args=(systems.find("phi4"),), kwargs={"integrator": integrator}, rounds=3)
     assert np.all(np.isfinite(found.u))
+
+
+@pytest.mark.benchmark(group="the bound of four terms, 31 sites, 50 samples")
+def test_bound(benchmark: Any) -> None:
+    phi4 = systems.find("phi4")
+    found = benchmark.pedantic(bound, args=(phi4, phi4.library("lib2")), rounds=3)
+    assert np.all(np.isfinite(found.stderr))
