@@ -27,7 +27,9 @@ def oscillators(steps: int = 60, *, seen: bool = True) -> Samples:
 
 
 @pytest.mark.parametrize("name", OWN)
-@pytest.mark.parametrize("noise", [0.0, 0.001, 0.01, 0.05])
+@pytest.mark.parametrize(
+    "noise", [0.0, 0.01, pytest.param(0.001, marks=pytest.mark.slow), pytest.param(0.05, marks=pytest.mark.slow)]
+)
 def test_the_choice_is_hardly_worse_than_the_median_of_what_was_searched(name: str, noise: float) -> None:
     system = systems.find(name)
     clean = simulate(system)

@@ -34,8 +34,8 @@ def seen(name, noise, seed, *, velocities=True, missing=0.0, ends=None, **option
     return replace(found, v=found.v if velocities else None, ends=ends or system.ends)
 
 
-def limit(system, candidates, noise):
-    return bound_of([replace(simulate(system), ends=system.ends)], candidates, system.order, noise=noise)
+def limit(system, candidates, noise, **options):
+    return bound_of([replace(simulate(system, **options), ends=system.ends)], candidates, system.order, noise=noise)
 
 
 def error(fit, truth):
@@ -142,16 +142,20 @@ def test_at_unknown_ends_dropping_the_widest_term_leaves_the_same_sites_an_equat
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "candidates"), FOUR)
-def test_intervals_cover_and_the_bound_is_reached_over_200_seeds(name, candidates):
+def test_intervals_cover_and_the_bound_is_reached_over_120_seeds(name, candidates):
     system = systems.find(name)
     one = system.library(candidates)
     truth = system.truth(one, {})
-    for noise in (0.01, 0.05):
-        fits = [solve(Trajectory(), [seen(name, noise, seed)], one, system.order, 0) for seed in range(200)]
-        scores = np.array([(fit.coefficients - truth) / fit.stderr for fit in fits])
-        assert 0.9 <= np.mean(np.abs(scores) < 1.96) <= 0.99
-        spread = np.sqrt(np.mean([error(fit, truth) ** 2 for fit in fits]))
-        assert limit(system, one, noise).relative / spread > 0.85
+    scores, squares = [], []
+    # Each noise with seeds of its own: the same numbers on another scale say nearly the same again.
+    for noise, seeds in ((0.01, range(60)), (0.05, range(60, 120))):
+        fits = [solve(Trajectory(), [seen(name, noise, seed, sites=15)], one, system.order, 0) for seed in seeds]
+        scores += [(fit.coefficients - truth) / fit.stderr for fit in fits]
+        known = limit(system, one, noise, sites=15).relative
+        squares += [(error(fit, truth) / known) ** 2 for fit in fits]
+    # The coefficients of a fit go together: as a share of 120 fits, 95 % has a standard error of 2 % at most.
+    assert 0.89 <= np.mean(np.abs(scores) < 1.96) <= 0.99
+    assert np.mean(squares) ** -0.5 > 0.85
 
 
 def test_the_start_from_the_weak_form_finds_what_pieces_lose():

@@ -243,7 +243,7 @@ def test_intervals_of_95_per_cent_cover_the_truth_about_that_often() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [0.001, 0.01, 0.05])
+@pytest.mark.parametrize("noise", [0.001, 0.05])
 @pytest.mark.parametrize(
     ("name", "listed", "changes"),
     [
@@ -256,10 +256,10 @@ def test_intervals_of_95_per_cent_cover_the_truth_about_that_often() -> None:
         ("sine-gordon", "lib2", {}),
     ],
 )
-def test_intervals_cover_the_truth_in_90_to_99_per_cent_of_200_seeds(
+def test_intervals_cover_the_truth_in_90_to_99_per_cent_of_100_seeds(
     name: str, listed: str, changes: dict[str, object], noise: float
 ) -> None:
-    assert 0.90 <= coverage(name, listed, noise, 200, **changes) <= 0.99
+    assert 0.90 <= coverage(name, listed, noise, 100, **changes) <= 0.99
 
 
 @pytest.mark.slow
@@ -267,7 +267,7 @@ def test_intervals_cover_the_truth_in_90_to_99_per_cent_of_200_seeds(
     ("name", "listed"),
     [("phi4", "lib2"), ("phi4", "lib3"), ("dnls", "four"), ("ginzburg-landau", "four"), ("sine-gordon", "lib2")],
 )
-@pytest.mark.parametrize(("noise", "allowed"), [(0.001, 1e-4), (0.01, 1e-3), (0.05, 1e-2)])
+@pytest.mark.parametrize(("noise", "allowed"), [(0.001, 1e-4), (0.05, 1e-2)])
 def test_the_support_is_right_in_19_of_20_seeds(name: str, listed: str, noise: float, allowed: float) -> None:
     terms, truth, order = candidates(name, listed)
     found = [judge(Weak().fit([seen(name, noise, k)], terms, order, seed=0), truth) for k in range(20)]

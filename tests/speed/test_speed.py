@@ -44,7 +44,7 @@ def test_an_integrator_is_timed(benchmark: Any, integrator: Any) -> None:
 
 
 @pytest.mark.benchmark(group="the bound of four terms, 31 sites, 50 samples")
-def test_bound(benchmark: Any) -> None:
+def test_the_bound_is_timed(benchmark: Any) -> None:
     phi4 = systems.find("phi4")
     found = benchmark.pedantic(bound, args=(phi4, phi4.library("lib2")), rounds=3)
     assert np.all(np.isfinite(found.stderr))
