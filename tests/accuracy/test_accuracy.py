@@ -1,7 +1,7 @@
 """Coefficient errors must not grow: the suite `accuracy` against the committed baseline, case by case.
 
-A case fails when its E2 (without a truth: its residual) exceeds FACTOR times the baseline's, both counted as at least
-the floor of `bench.compare`. After a change that is meant to move errors, write the baseline anew and read its
+A case has grown when its E2 (without a truth: its residual) exceeds FACTOR times that of the baseline, both counted as
+at least the floor of `bench.compare`. After a change that is meant to move errors, write the baseline anew and read its
 difference:
 
     latticebench run accuracy --results runs/accuracy && python tests/accuracy/write_baseline.py runs/accuracy

@@ -57,7 +57,7 @@ def test_the_bound_is_the_spread_of_the_maximum_likelihood_fit(name, candidates,
 def test_the_bound_is_the_spread_over_80_seeds(name, candidates, velocities):
     errors, limit = spread(name, candidates, 0.01, 80, velocities, sites=15)
     seeds, terms = errors.shape
-    # Mean squares over their expectation, of each term and of all in their covariance: one in 5000 is beyond the bounds.
+    # Mean squares over their expectation, of each term and of all in their covariance: 1 in 5000 is outside.
     low, high = chi2.ppf([1e-4, 1 - 1e-4], seeds) / seeds
     each = np.mean(errors**2, axis=0) / limit.stderr**2
     assert np.all((low < each) & (each < high))
