@@ -63,13 +63,14 @@ def errors(name, course):
 
 # Effects whose lack shifts the declared coefficients, on lattices of both orders.
 PAIRS = [
-    ("phi4", "damping"), ("phi4", "drive"), ("phi4", "defect"), ("phi4", "trap"), ("sine-gordon", "sensor-offset"),
-    ("sine-gordon", "unequal-masses"), ("phi4", "next-neighbour"), ("dnls", "trap"), ("dnls", "sensor-gain"),
-    ("ginzburg-landau", "gain-loss"),
+    ("phi4", "damping"), ("phi4", "drive"), ("phi4", "defect"), ("sine-gordon", "unequal-masses"),
+    ("dnls", "sensor-gain"), ("ginzburg-landau", "gain-loss"),
 ]  # fmt: skip
+FURTHER = [("phi4", "trap"), ("sine-gordon", "sensor-offset"), ("phi4", "next-neighbour"), ("dnls", "trap")]
+EACH = [*PAIRS, *(pytest.param(*pair, marks=pytest.mark.slow) for pair in FURTHER)]
 
 
-@pytest.mark.parametrize(("name", "effect"), PAIRS)
+@pytest.mark.parametrize(("name", "effect"), EACH)
 def test_the_effect_that_is_missing_is_the_one_that_is_added(name, effect):
     specimen, course, _ = looped(name, effect)
     assert names(course) == [effect]
@@ -82,7 +83,7 @@ def test_the_effect_that_is_missing_is_the_one_that_is_added(name, effect):
         assert course.after.model.effects[0].site == specimen.about["site"]
 
 
-@pytest.mark.parametrize(("name", "effect"), PAIRS)
+@pytest.mark.parametrize(("name", "effect"), EACH)
 def test_after_the_cure_only_noise_is_left(name, effect):
     _, course, sigma = looped(name, effect)
     assert residual_rms(course.before, sigma) > 1.1
@@ -90,17 +91,21 @@ def test_after_the_cure_only_noise_is_left(name, effect):
     assert course.left == ()
 
 
+@pytest.mark.slow
 def test_after_the_cure_the_declared_coefficients_are_nearer_to_the_truth():
     """On the whole: of one recording the noise may have hidden the shift."""
-    before, after = np.transpose([errors(name, looped(name, effect)[1]) for name, effect in PAIRS])
+    before, after = np.transpose([errors(name, looped(name, effect)[1]) for name, effect in [*PAIRS, *FURTHER]])
     assert np.exp(np.mean(np.log(after / before))) < 0.6
     assert np.mean(after < before) >= 0.8
 
 
 @pytest.mark.parametrize(
     ("name", "effect", "sign"),
-    [("phi4", "damping", -1), ("phi4", "trap", 1), ("phi4", "next-neighbour", 1), ("phi4", "defect", 1)],
-)
+    [
+        ("phi4", "damping", -1), ("phi4", "defect", 1), pytest.param("phi4", "trap", 1, marks=pytest.mark.slow),
+        pytest.param("phi4", "next-neighbour", 1, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_its_coefficient_is_the_one_that_is_in_the_data(name, effect, sign):
     specimen, course, _ = looped(name, effect)
     count = len(course.before.model.declared.terms)
@@ -121,7 +126,7 @@ def test_the_parameter_that_was_searched_is_within_its_error():
 
 
 @pytest.mark.parametrize("name", ["phi4", "sine-gordon", "dnls", "ginzburg-landau"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_where_nothing_is_missing_nothing_is_added(name, seed):
     _, course, sigma = looped(name, "none", 0, seed)
     assert course.verdict == "nothing missing"
@@ -132,8 +137,9 @@ def test_where_nothing_is_missing_nothing_is_added(name, seed):
 
 
 OUTSIDE = [
-    ("phi4", "other: weak-bond"), ("phi4", "other: friction-between"), ("sine-gordon", "other: friction-between"),
-    ("dnls", "other: weak-bond"),
+    ("phi4", "other: weak-bond"), ("sine-gordon", "other: friction-between"),
+    pytest.param("phi4", "other: friction-between", marks=pytest.mark.slow),
+    pytest.param("dnls", "other: weak-bond", marks=pytest.mark.slow),
 ]  # fmt: skip
 
 
@@ -145,6 +151,7 @@ def test_what_is_outside_the_catalogue_gets_no_wrong_name(name, effect):
     assert residual_rms(course.after, sigma) > 1.1
 
 
+@pytest.mark.slow
 def test_forces_that_no_offset_of_a_sensor_makes_are_not_the_sensors():
     """Where the chain is not linear, a push at each site is another thing than a reading that is lifted."""
     _, pushed, _ = looped("sine-gordon", "other: uneven-floor", sites=15)
@@ -156,6 +163,7 @@ def test_forces_that_no_offset_of_a_sensor_makes_are_not_the_sensors():
     assert (lifted.verdict, lifted.rival) == ("explained", None)
 
 
+@pytest.mark.slow
 def test_dry_friction_is_named_and_fitted_to_the_end_though_its_sign_jumps():
     specimen, course, _ = looped("sine-gordon", "dry-friction")
     assert names(course)[:1] == ["dry-friction"]
@@ -204,7 +212,9 @@ def driven_chain(force):
     return diagnose(library("own", "u[n+1]+u[n-1]-2*u[n]; u[n]"), 2, [data], CATALOGUE)
 
 
-@pytest.mark.parametrize("size", [0.02, 0.2, 2.0])
+@pytest.mark.parametrize(
+    "size", [0.2, pytest.param(0.02, marks=pytest.mark.slow), pytest.param(2.0, marks=pytest.mark.slow)]
+)
 def test_a_drive_is_found_however_strong_it_is(size):
     found = driven_chain(lambda t: size * np.cos(2.2 * t - 1))
     assert found.course.verdict == "explained"
@@ -214,12 +224,14 @@ def test_a_drive_is_found_however_strong_it_is(size):
     assert found.residual[1] < 1.1
 
 
+@pytest.mark.slow
 def test_harmonics_that_stand_for_another_course_are_no_explanation():
     """A motion that is pushed by three waves of no common frequency has no drive, however well a few of them do."""
     found = driven_chain(lambda t: 0.05 * (np.cos(0.9 * t) + np.cos(1.7 * t + 1) + np.cos(2.9 * t + 2)))
     assert found.course.verdict in ("unexplained", "partly explained")
 
 
+@pytest.mark.slow
 def test_names_that_leave_the_readings_lost_are_not_given():
     """Forces as strong as the motion that look like noise: whatever comes nearest explains next to nothing of them."""
     draw = np.random.default_rng(8)
@@ -241,6 +253,7 @@ def test_names_that_leave_the_readings_lost_are_not_given():
     assert found.course.left
 
 
+@pytest.mark.slow
 def test_disorder_has_a_mean_of_its_own_where_the_equation_has_no_such_term():
     """Sine-Gordon declares sin u and no u: the sites' coefficients are those that were put in, not their deviations."""
     t, sites = np.linspace(0, 8, 60), 9
@@ -417,6 +430,7 @@ def test_trajectories_of_different_lengths_are_looked_at_together():
     assert found.course.verdict == "nothing missing"
 
 
+@pytest.mark.slow
 def test_a_friction_that_drives_is_none():
     """u'' = -u + 0.02 sign(v), or - 0.02 sign(v), solved piece by piece between the turns: circles about +-0.02."""
     t = np.linspace(0, 20, 200)

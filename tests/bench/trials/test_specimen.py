@@ -29,12 +29,6 @@ from latticebench.systems.lattice import library
 
 SMALL = {"sites": 7, "samples": 20, "span": 4.0}
 NAMES = ["phi4", "sine-gordon", "dnls", "ginzburg-landau"]
-EVERY = [
-    (name, effect)
-    for name in ("phi4", "dnls")
-    for effect in FAULTS
-    if effect != NONE and sensible(effect, systems.find(name))
-]
 SOME = [
     ("phi4", "drive"), ("phi4", "long-range"), ("phi4", "ends"), ("phi4", "known-input"), ("phi4", "clock"),
     ("phi4", "sensor-curve"), ("phi4", "other: noise-force"), ("dnls", "disorder"), ("dnls", "unequal-masses"),
@@ -44,6 +38,18 @@ SOME = [
     ("phi4", "other: mains-hum"), ("dnls", "other: inner-resonators"), ("phi4", "other: stray-spikes"),
     ("phi4", "other: two-level-defect"), ("dnls", "other: parallel-chain"), ("phi4", "other: wandering-reference"),
     ("dnls", "other: resampled-rows"),
+]  # fmt: skip
+# Of each kind of sizing (pushes, what is not seen, instruments) some are quick tests; the others are long.
+EVERY = [
+    pytest.param(name, effect, marks=() if (name, effect) in SOME else pytest.mark.slow)
+    for name in ("phi4", "dnls")
+    for effect in FAULTS
+    if effect != NONE and sensible(effect, systems.find(name))
+]
+# One for each kind of draw: of places, times, frequencies, random forces, random coefficients, random readings.
+DRAWN = [
+    ("phi4", "drive"), ("phi4", "clock"), ("dnls", "disorder"), ("dnls", "memory"), ("dnls", "sensor-offset"),
+    ("phi4", "other: noise-force"), ("phi4", "other: stray-spikes"), ("phi4", "other: wandering-reference"),
 ]  # fmt: skip
 
 
@@ -93,7 +99,7 @@ def test_its_size_is_the_coefficient_over_the_standard_error_of_a_fit(name, effe
     assert np.real(one.amount) / error == pytest.approx(12, rel=0.25)
 
 
-@pytest.mark.parametrize(("name", "effect"), SOME)
+@pytest.mark.parametrize(("name", "effect"), DRAWN)
 def test_the_same_generator_gives_the_same_specimen(name, effect):
     one, other, third = drawn(name, effect), made(name, effect, 15), made(name, effect, 15, seed=3)
     assert np.array_equal(one.samples.u, other.samples.u)

@@ -15,6 +15,9 @@ from latticebench.bench.trials.faults import (
 )
 from latticebench.bench.trials.specimen import Conditions, make
 
+# What is made of a real and of a complex field in the same way; the second is a long test.
+BOTH = ["phi4", pytest.param("dnls", marks=pytest.mark.slow)]
+
 SMALL = {"sites": 7, "samples": 20, "span": 4.0}
 
 
@@ -49,7 +52,7 @@ def lied(name, effect, **options):
     return one.clean.u, plain.clean.u, one
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_drifting_sensor_warms_up(name):
     shown, true, one = lied(name, "other: drifting-sensor")
     site, t = int(one.about["site"]), one.clean.t
@@ -61,7 +64,7 @@ def test_a_drifting_sensor_warms_up(name):
     assert np.max(np.abs(drift.imag)) == 0
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_crosstalk_is_of_sensors_side_by_side(name):
     shown, true, one = lied(name, "other: neighbour-crosstalk")
     amount = np.real(one.amount)
@@ -72,7 +75,7 @@ def test_crosstalk_is_of_sensors_side_by_side(name):
         np.testing.assert_allclose(mixed[:, 6] - own[:, 6], amount * own[:, 5], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_slow_sensor_follows_the_field_as_an_rc_filter(name):
     shown, true, one = lied(name, "other: slow-sensor", samples=100)
     site, lag, t = int(one.about["site"]), np.real(one.amount), one.clean.t
@@ -86,7 +89,7 @@ def test_a_slow_sensor_follows_the_field_as_an_rc_filter(name):
         assert abs(shown[k, site] - filtered) < 0.01 * np.max(np.abs(shown - true))
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_clipped_reading_stays_within_its_range(name):
     shown, true, _ = lied(name, "other: clipped-reading")
     parts = [(shown.real, true.real)] if name == "phi4" else [(shown.real, true.real), (shown.imag, true.imag)]
@@ -98,7 +101,7 @@ def test_a_clipped_reading_stays_within_its_range(name):
         np.testing.assert_allclose(part[~inside], np.sign(own[~inside]) * limit, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_channels_are_read_one_after_the_other(name):
     one, plain = drawn(name, "other: scanned-channels", z=40), drawn(name, NONE, samples=400)
     sweep, t = np.real(one.amount), one.clean.t
@@ -114,7 +117,7 @@ def test_channels_are_read_one_after_the_other(name):
             np.testing.assert_allclose(shown[seen, site], whole(late[seen])[:, site], atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_the_mains_hum_in_step_in_all_wires(name):
     shown, true, one = lied(name, "other: mains-hum", samples=100)
     hum, t = shown - true, one.clean.t
@@ -126,7 +129,7 @@ def test_the_mains_hum_in_step_in_all_wires(name):
     np.testing.assert_allclose(hum.real, np.real(one.amount) * np.outer(wave, strengths), atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_slack_needle_stays_until_it_is_dragged(name):
     shown, true, one = lied(name, "other: slack-needle", samples=400)
     slack = np.real(one.amount)
@@ -142,7 +145,7 @@ def test_a_slack_needle_stays_until_it_is_dragged(name):
         np.testing.assert_allclose((field - needle)[1:-1][dragged], slack * moves[1:][dragged], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_flickering_lamp_lights_all_sites_alike(name):
     shown, true, one = lied(name, "other: flickering-lamp")
     bright = np.sum(shown * np.conj(true), axis=1) / np.sum(np.abs(true) ** 2, axis=1)
@@ -153,7 +156,7 @@ def test_a_flickering_lamp_lights_all_sites_alike(name):
         np.testing.assert_allclose(one.clean.v, np.real(bright)[:, None] * drawn(name, NONE).clean.v, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_an_averaging_readout_gives_means_over_the_time_after_each_sample(name):
     shown, _, one = lied(name, "other: averaging-readout")
     plain = drawn(name, NONE, samples=800)
@@ -165,14 +168,14 @@ def test_an_averaging_readout_gives_means_over_the_time_after_each_sample(name):
         np.testing.assert_allclose(shown[k], mean, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_floating_ground_is_lifted_by_the_mean_of_all_sites(name):
     shown, true, one = lied(name, "other: floating-ground")
     lifted = np.repeat(np.sum(true, axis=1)[:, None] / 7, 7, axis=1)
     np.testing.assert_allclose(true - shown, np.real(one.amount) * lifted, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_tilted_camera_shows_one_end_too_large_and_the_other_too_small(name):
     shown, true, one = lied(name, "other: tilted-camera")
     scale = 1 + np.real(one.amount) * np.linspace(-1, 1, 7)
@@ -181,7 +184,7 @@ def test_a_tilted_camera_shows_one_end_too_large_and_the_other_too_small(name):
         np.testing.assert_allclose(one.clean.v, scale * drawn(name, NONE).clean.v, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_stray_spikes_are_few_and_leave_the_other_readings_alone(name):
     shown, true, one = lied(name, "other: stray-spikes", samples=100)
     size, off = np.real(one.amount), (shown - true)[shown != true]
@@ -193,7 +196,7 @@ def test_stray_spikes_are_few_and_leave_the_other_readings_alone(name):
     assert np.sum(few != sound) == 3
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_behind_a_capacitor_what_is_constant_fades(name):
     shown, true, one = lied(name, "other: ac-coupling", samples=200)
     leak, t = np.real(one.amount), one.clean.t
@@ -210,7 +213,7 @@ def pairs_of(name, one, **options):
     return [(one.clean.u, plain.clean.u), *([] if name == "dnls" else [(one.clean.v, plain.clean.v)])]
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_converter_keeps_a_share_of_what_it_read_before(name):
     _, _, one = lied(name, "other: converter-residue")
     share = np.real(one.amount)
@@ -221,7 +224,7 @@ def test_a_converter_keeps_a_share_of_what_it_read_before(name):
         np.testing.assert_allclose(shown.reshape(-1), read, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_an_error_of_fringes_is_that_of_a_phase_with_a_small_ghost(name):
     shown, true, one = lied(name, "other: cyclic-error")
     size, cycle = np.real(one.amount), one.about["cycle"]
@@ -230,7 +233,7 @@ def test_an_error_of_fringes_is_that_of_a_phase_with_a_small_ghost(name):
         np.testing.assert_allclose(read - field, size * 2 * fringe.real * fringe.imag, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_camera_dims_what_was_bright_a_row_ago(name):
     shown, true, one = lied(name, "other: auto-exposure")
     seen = np.real(np.sum(shown * true.conj(), axis=1) / np.sum(np.abs(true) ** 2, axis=1))
@@ -242,7 +245,7 @@ def test_a_camera_dims_what_was_bright_a_row_ago(name):
         assert (1 - seen[k]) / np.real(one.amount) == pytest.approx((light[k - 1] - light[0]) / light[0], abs=1e-9)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_reference_wanders_by_small_steps_for_all_sensors_alike(name):
     shown, true, one = lied(name, "other: wandering-reference", samples=100)
     off = (shown - true) / np.real(one.amount)
@@ -256,7 +259,7 @@ def test_a_reference_wanders_by_small_steps_for_all_sensors_alike(name):
     assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 0.3
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_second_card_falls_behind_the_first(name):
     _, _, one = lied(name, "other: two-cards")
     size, t = np.real(one.amount), one.clean.t
@@ -278,7 +281,7 @@ def test_mixers_that_are_not_alike_show_one_part_larger_than_the_other():
     np.testing.assert_allclose(shown.imag, (1 - size) * true.imag, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_resampled_rows_lie_on_straight_lines_between_the_recorders_own(name):
     _, _, one = lied(name, "other: resampled-rows")
     dense, step, t = drawn(name, NONE, samples=400), np.sqrt(np.real(one.amount)), one.clean.t

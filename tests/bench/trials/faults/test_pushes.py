@@ -13,6 +13,9 @@ from latticebench import systems
 from latticebench.bench.trials.faults import NONE
 from latticebench.bench.trials.specimen import Conditions, make
 
+# What is made of a real and of a complex field in the same way; the second is a long test.
+BOTH = ["phi4", pytest.param("dnls", marks=pytest.mark.slow)]
+
 SMALL = {"sites": 7, "samples": 20, "span": 4.0}
 
 
@@ -121,16 +124,23 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
     np.testing.assert_allclose(one.clean.v, y[:, 7:], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("effect", "turn"),
-    [
-        ("nonlinear-loss", -1), ("asymmetric-coupling", 1), ("other: phase-conjugation", 1), ("other: plane-wave", 1),
-        ("other: stray-wire", 1), ("other: nonlocal-response", 1), ("other: pumped-coupling", 1),
-        ("other: three-body", 1),
-        ("other: end-stops", -1), ("other: sweeping-drive", 1), ("other: tapped-site", 1), ("other: one-way-bond", 1),
-        ("other: self-steepening", 1), ("other: shared-load", -1), ("other: ticking-pump", 1),
-    ],
-)  # fmt: skip
+# Those that a real field has, too, are long tests.
+OF_COMPLEX_FIELDS = [
+    ("nonlinear-loss", -1), ("asymmetric-coupling", 1), ("other: phase-conjugation", 1),
+    ("other: nonlocal-response", 1),
+    *(
+        pytest.param(effect, turn, marks=pytest.mark.slow)
+        for effect, turn in [
+            ("other: plane-wave", 1), ("other: stray-wire", 1), ("other: pumped-coupling", 1),
+            ("other: three-body", 1), ("other: end-stops", -1), ("other: sweeping-drive", 1),
+            ("other: tapped-site", 1), ("other: one-way-bond", 1), ("other: self-steepening", 1),
+            ("other: shared-load", -1), ("other: ticking-pump", 1),
+        ]
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("effect", "turn"), OF_COMPLEX_FIELDS)
 def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
     one = drawn("dnls", effect, z=40, noise=0.05)
     coupling, cubic = truth_of("dnls")
@@ -193,7 +203,7 @@ def test_an_unsteady_supply_changes_the_linear_term_of_all_sites_alike():
     assert np.min(supply) < 0 < np.max(supply)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_an_uneven_floor_pushes_each_site_always_the_same_way(name):
     one = drawn(name, "other: uneven-floor", z=40, noise=0.05, samples=400)
     t, u = one.clean.t, one.clean.u
@@ -226,7 +236,7 @@ def missing(name, effect):
 INSIDE = slice(10, -10)
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_floor_that_rumbles_shakes_all_sites_alike_at_five_frequencies(name):
     one, force = missing(name, "other: rumbling-floor")
     shaken = np.mean(force, axis=1)[INSIDE] / one.amount

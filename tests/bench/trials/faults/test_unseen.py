@@ -12,6 +12,9 @@ from scipy.interpolate import CubicSpline
 from latticebench import systems
 from latticebench.bench.trials.specimen import Conditions, make
 
+# What is made of a real and of a complex field in the same way; the second is a long test.
+BOTH = ["phi4", pytest.param("dnls", marks=pytest.mark.slow)]
+
 SMALL = {"sites": 7, "samples": 20, "span": 4.0}
 
 
@@ -203,7 +206,7 @@ def test_a_slipping_spring_forgets_by_the_way_gone_and_not_by_time():
         np.testing.assert_allclose(bend[row - 1], left, atol=0.02 * np.max(np.abs(bend)))
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_bonds_that_share_inertia_feel_how_neighbours_accelerate(name):
     one = drawn(name, "other: shared-inertia", z=40, noise=0.05, samples=400)
     t, u = one.clean.t, one.clean.u
@@ -222,7 +225,7 @@ def test_bonds_that_share_inertia_feel_how_neighbours_accelerate(name):
     assert np.max(np.abs(left)) < 0.01 * np.max(np.abs(missing))
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_viscoelastic_bond_forgets_how_it_was_stretched(name):
     one, force = missing(name, "other: viscoelastic-bonds")
     t, u = one.clean.t, one.clean.u
@@ -235,7 +238,7 @@ def test_a_viscoelastic_bond_forgets_how_it_was_stretched(name):
         np.testing.assert_allclose(force[k], pull, atol=1e-3 * np.max(np.abs(force)))
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_bond_is_tired_by_all_that_it_has_borne(name):
     one, force = missing(name, "other: fatiguing-bonds")
     t, u = one.clean.t, one.clean.u
@@ -248,7 +251,7 @@ def test_a_bond_is_tired_by_all_that_it_has_borne(name):
     np.testing.assert_allclose(force[INSIDE], pull[INSIDE], atol=1e-3 * np.max(np.abs(pull)))
 
 
-@pytest.mark.parametrize("name", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", BOTH)
 def test_a_servo_pushes_back_by_how_far_and_how_long_the_mean_was_away(name):
     one, force = missing(name, "other: holding-loop")
     t = one.clean.t
