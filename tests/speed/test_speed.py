@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from latticebench import methods, systems
-from latticebench.bench.limit import bound
+from latticebench.bench.limit import bound_of
 from latticebench.methods.method import make, solve
 from latticebench.systems.samples import Samples
 from latticebench.systems.simulate import observe, simulate
@@ -45,6 +45,7 @@ def test_an_integrator_is_timed(benchmark: Any, integrator: Any) -> None:
 
 @pytest.mark.benchmark(group="the bound of four terms, 31 sites, 50 samples")
 def test_the_bound_is_timed(benchmark: Any) -> None:
-    phi4 = systems.find("phi4")
-    found = benchmark.pedantic(bound, args=(phi4, phi4.library("lib2")), rounds=3)
+    library = systems.find("phi4").library("lib2")
+    truth = simulate(systems.find("phi4"), integrator="dop853")
+    found = benchmark.pedantic(bound_of, args=([truth], library, 2), kwargs={"noise": 0.01}, rounds=3)
     assert np.all(np.isfinite(found.stderr))
