@@ -44,7 +44,7 @@ class Kind:
 
 def _fit() -> Kind:
     from latticebench.bench import figures, publish
-    from latticebench.bench.screen import show_results
+    from latticebench.bench.report.screen import show_results
     from latticebench.bench.tables import cases
 
     return Kind(publish.TABLES, figures.FIGURES, cases, show_results, publish.publish, figures.draw_all)

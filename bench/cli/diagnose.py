@@ -70,7 +70,7 @@ def diagnose(
 ) -> None:
     """Find what a declared equation lacks: trace its residual to an effect, add it, show the error before and after."""
     from latticebench import methods
-    from latticebench.bench.screen import watching
+    from latticebench.bench.report.screen import watching
     from latticebench.diagnosis.repair import diagnose as close_the_loop
     from latticebench.methods.method import make, solve
     from latticebench.systems.effects import CATALOGUE

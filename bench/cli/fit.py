@@ -46,7 +46,7 @@ def fit(
 ) -> None:
     """Fit the coefficients of a library to recorded samples."""
     from latticebench import methods
-    from latticebench.bench.screen import show_fit, waiting
+    from latticebench.bench.report.screen import show_fit, waiting
     from latticebench.methods.method import make, solve
     from latticebench.systems.files import write_text
     from latticebench.systems.readers import read_all

@@ -96,7 +96,7 @@ BoundAt = Callable[[int, int], "Limit"]
 def _of_recordings(files: Sequence[Path], candidates: Library, order: int, ends: AnyEnds) -> tuple[str, BoundAt]:
     """Return where the bound of recorded samples is taken, and the bound."""
     from latticebench.bench.limit import denser
-    from latticebench.bench.screen import waiting
+    from latticebench.bench.report.screen import waiting
     from latticebench.systems.readers import read_all
 
     data = read_all(files, ends)
@@ -139,7 +139,7 @@ def _of_simulated(case: FitCase) -> tuple[str, BoundAt]:
 def _report(note: str, bound_at: BoundAt, target: float, json_out: str | None) -> None:
     """Take the bound and show it, or write it as JSON."""
     from latticebench.bench.limit import design
-    from latticebench.bench.screen import show_limit, waiting
+    from latticebench.bench.report.screen import show_limit, waiting
     from latticebench.systems.files import write_text
 
     with waiting("taking the bound"):

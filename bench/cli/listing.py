@@ -18,7 +18,7 @@ def list_(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
 ) -> None:
     """List what there is."""
-    from latticebench.bench.screen import show_rows
+    from latticebench.bench.report.screen import show_rows
 
     makers = {
         "systems": _system_rows, "libraries": _library_rows, "methods": _method_rows, "suites": _suite_rows,

@@ -38,8 +38,8 @@ def run(
     """Run a suite, continuing where it was stopped, and show its results."""
     from latticebench.bench import kinds
     from latticebench.bench.provenance import command_line
+    from latticebench.bench.report.screen import progress_bar
     from latticebench.bench.run import run as run_suite
-    from latticebench.bench.screen import progress_bar
     from latticebench.bench.store import create
     from latticebench.bench.suite import load
 

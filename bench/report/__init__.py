@@ -1,1 +1,1 @@
-"""What people and programs see: a diagnosis as text, JSON and HTML page, and the JSON documents of all commands."""
+"""What people and programs see: results and diagnoses on a terminal, JSON documents, a diagnosis as an HTML page."""

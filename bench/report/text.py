@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from latticebench.bench.report import rows
 from latticebench.bench.report.content import Report, Turn
-from latticebench.bench.screen import console, show_rows
+from latticebench.bench.report.screen import console, show_rows
 
 
 def show(report: Report) -> None:

@@ -77,7 +77,7 @@ def draw_all(
 
 def show(results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], title: str = "", value: str = "") -> None:  # noqa: ARG001
     """Print the verdict on each recording."""
-    from latticebench.bench.screen import console, show_rows
+    from latticebench.bench.report.screen import console, show_rows
 
     if title:
         console().print(title, style="bold", highlight=False)

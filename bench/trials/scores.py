@@ -204,7 +204,7 @@ def _save(frame: pd.DataFrame, about: Mapping[str, Any], folder: Path) -> list[P
 
 def show(results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], title: str = "", value: str = "") -> None:  # noqa: ARG001
     """Print how often the diagnosis was right."""
-    from latticebench.bench.screen import console, show_rows
+    from latticebench.bench.report.screen import console, show_rows
 
     if title:
         console().print(title, style="bold", highlight=False)
