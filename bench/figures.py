@@ -129,7 +129,7 @@ def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _colours(terms: Sequence[str], truth: Mapping[str, float] | None) -> dict[str, str]:
-    """Give each term that is in the equation a colour of its own, and black to the absent ones."""
+    """Return a colour per term: one of its own where the term is in the equation, else black."""
     colours = iter(COLOURS)
     return {term: "black" if truth is not None and truth[term] == 0 else next(colours, "tab:gray") for term in terms}
 

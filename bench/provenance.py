@@ -100,7 +100,7 @@ def machine() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Give the versions of Python, of this package, and of the packages that it needs."""
+    """Return the versions of Python, of this package, and of the packages that it needs."""
     found = {"python": platform.python_version()}
     try:
         needed = [line for line in metadata.requires(DISTRIBUTION) or () if "extra ==" not in line]
@@ -130,5 +130,5 @@ def lines(about: Mapping[str, Any]) -> list[str]:
 
 
 def command_line() -> list[str]:
-    """Give the arguments of this process, without the path of the program."""
+    """Return the arguments of this process, without the path of the program."""
     return sys.argv[1:]

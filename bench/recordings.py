@@ -95,7 +95,7 @@ def find(name: str) -> Recording:
 
 
 def fingerprint(path: Path) -> str:
-    """Give the SHA-256 of a file.
+    """Return the SHA-256 of a file.
 
     Raises:
         InputError: it cannot be read.

@@ -70,7 +70,7 @@ def score(found: Float[ndarray, " terms"], truth: Float[ndarray, " terms"], shar
 
 
 def support(found: Float[ndarray, " terms"], shares: Float[ndarray, " terms"]) -> Bool[ndarray, " terms"]:
-    """Say which terms count as found."""
+    """Return which terms count as found."""
     present: ndarray = np.abs(found) * shares >= PRESENT
     return present
 

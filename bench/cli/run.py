@@ -43,8 +43,8 @@ def run(
     from latticebench.bench.store import create
     from latticebench.bench.suite import load
 
-    part = shard_of(shard)
     loaded = load(suite, data)
+    part = shard_of(shard, len(loaded.cases))
     folder = results if results is not None else Path("runs") / loaded.name
     store = create(folder)
     jobs = jobs or os.cpu_count() or 1
@@ -70,11 +70,11 @@ def run(
     print(f"{len(found)} cases ({statuses}); {tally.ran} run now, {tally.reused} were there; kept in {folder}")
 
 
-def shard_of(text: str | None) -> Shard:
-    """Read K/N.
+def shard_of(text: str | None, cases: int) -> Shard:
+    """Read K/N as a part of a suite of so many cases; all of it for None.
 
     Raises:
-        InputError: it is no part of a suite.
+        InputError: there is no such part.
     """
     from latticebench.bench.store import WHOLE, Shard
 
@@ -83,6 +83,8 @@ def shard_of(text: str | None) -> Shard:
     found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip())
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         raise InputError(f"--shard {text}: write K/N with K from 1 to N, such as 1/10 for every tenth case")
+    if int(found[1]) > cases:
+        raise InputError(f"--shard {text}: there is no case {found[1]}, the suite has {cases}")
     return Shard(int(found[1]), int(found[2]))
 
 

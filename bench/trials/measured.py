@@ -42,7 +42,7 @@ class Measured(Case):
     order: Literal[1, 2]
     ends: Ends = "unknown"
     time_limit: Annotated[float, pydantic.Field(gt=0, allow_inf_nan=False)] = 7200.0
-    memory_limit: pydantic.PositiveInt = 8192
+    memory_limit: pydantic.PositiveInt = 16_384
 
     @property
     def title(self) -> str:

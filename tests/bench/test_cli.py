@@ -299,6 +299,7 @@ BAD_COMMANDS = {
     "run tiny --results phi4.csv": "a file, not a folder",
     "run tiny --shard 0/3": "--shard 0/3: write K/N with K from 1 to N",
     "run tiny --shard 4/3": "--shard 4/3: write K/N",
+    "run tiny --shard 10/12 --results new": "--shard 10/12: there is no case 10, the suite has 9",
     "run tiny --shard half": "--shard half: write K/N",
     "run tiny --results json": "a store of version 2 or older",
     "table json": "a store of version 2 or older",
