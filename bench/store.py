@@ -1,6 +1,6 @@
 """The store of results: one SQLite file in the folder of a run.
 
-    results  one row per finished case: key, identity, kind, case, status, reason, origin, content, history
+    results  one row per finished case: key, identity, kind, case, status, reason, seed, origin, content, history
     origins  what made results: commit, date, machine and versions, each once
     suite    the keys of the suite that was run last, in their order
     about    what else was written down of that run: command, settings
@@ -36,10 +36,10 @@ TABLES = """
 CREATE TABLE IF NOT EXISTS origins (number INTEGER PRIMARY KEY, origin TEXT NOT NULL UNIQUE);
 CREATE TABLE IF NOT EXISTS results (
     key TEXT PRIMARY KEY, identity TEXT NOT NULL, kind TEXT NOT NULL, "case" TEXT NOT NULL, status TEXT NOT NULL,
-    reason TEXT NOT NULL, origin INTEGER NOT NULL REFERENCES origins, content TEXT NOT NULL, history TEXT
+    reason TEXT NOT NULL, seed INTEGER, origin INTEGER NOT NULL REFERENCES origins, content TEXT NOT NULL, history TEXT
 );
 CREATE INDEX IF NOT EXISTS by_identity ON results (identity, key);
-CREATE INDEX IF NOT EXISTS by_key ON results (key, kind, status, origin);
+CREATE INDEX IF NOT EXISTS by_key ON results (key, kind, status, seed, origin);
 CREATE TABLE IF NOT EXISTS suite (place INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE);
 CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 """
@@ -91,12 +91,13 @@ class Store:
         if status not in STATUSES or content.keys() != case.blank().keys():
             raise ValueError(f"not a result of {case.title}: status {status!r}, with {sorted(content)}")
         history = content.pop("history", None)
+        seed = getattr(case, "seed", None)
         texts = [None if value is None else json.dumps(value, allow_nan=False) for value in (made, content, history)]
         with self._writing() as cursor:
             cursor.execute("INSERT OR IGNORE INTO origins (origin) VALUES (?)", texts[:1])
             cursor.execute(
-                "INSERT OR REPLACE INTO results SELECT ?, ?, ?, ?, ?, ?, number, ?, ? FROM origins WHERE origin = ?",
-                (key, case.identity, case.kind, case.model_dump_json(), status, reason, *texts[1:], texts[0]),
+                "INSERT OR REPLACE INTO results SELECT ?, ?, ?, ?, ?, ?, ?, number, ?, ? FROM origins WHERE origin = ?",
+                (key, case.identity, case.kind, case.model_dump_json(), status, reason, seed, *texts[1:], texts[0]),
             )
 
     def plan(self, keys: Mapping[str, str], about: Mapping[str, Any]) -> None:
@@ -175,8 +176,7 @@ class Store:
 
     def seeds(self) -> list[int]:
         """Return the seeds of the finished cases of the suite that was run last."""
-        seed = """json_extract("case", '$.seed')"""
-        rows = self.read(f"SELECT DISTINCT {seed} AS seed FROM suite JOIN results USING (key) ORDER BY seed")
+        rows = self.read("SELECT DISTINCT seed FROM suite JOIN results USING (key) ORDER BY seed")
         return [number for (number,) in rows if number is not None]
 
     @contextmanager

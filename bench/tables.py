@@ -120,7 +120,7 @@ def _covered(result: Mapping[str, Any]) -> float:
     held = [
         abs(value - truth[term]) <= INTERVAL * _number(errors[term]) for term, value in result["coefficients"].items()
     ]
-    return float(np.mean(held))
+    return float(sum(held) / len(held))
 
 
 def summary(table: pd.DataFrame) -> pd.DataFrame:
