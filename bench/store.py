@@ -101,7 +101,7 @@ class Store:
             )
 
     def plan(self, keys: Mapping[str, str], about: Mapping[str, Any]) -> None:
-        """Write down which suite is run, and remove what an older source made of its cases.
+        """Record which suite is run, and remove what an older source made of its cases.
 
         Args:
             keys: of the cases, by their identities.
@@ -128,7 +128,7 @@ class Store:
             )
 
     def relabel(self, cases: Mapping[str, Case]) -> None:
-        """Write down cases as they are called and limited in this suite; the keys are those of their results."""
+        """Record the labels and limits that cases have in this suite; the keys are those of their results."""
         with self._writing() as cursor:
             rows = [(case.model_dump_json(), key) for key, case in cases.items()]
             cursor.executemany('UPDATE results SET "case" = ? WHERE key = ?', rows)

@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 def asked(
     system: str | None, library: str | None, terms: str | None, order: int | None
 ) -> tuple[System | None, Library, int]:
-    """Make out which library and order --system, --library, --terms and --order ask for."""
+    """Return the system, library and order that --system, --library, --terms and --order ask for.
+
+    Raises:
+        InputError: they contradict one another, or do not suffice.
+    """
     from latticebench import systems
     from latticebench.systems.lattice import library as make_library
 
@@ -91,7 +95,7 @@ def numbers(given: Sequence[str] | None) -> dict[str, float]:
 
 @contextmanager
 def told(data: Sequence[Samples], method: str | None, what: str) -> Iterator[None]:
-    """Say in one line why nothing came of a fit.
+    """Turn whatever ends a fit into one line of text.
 
     Raises:
         InputError: it was skipped, or it failed.
