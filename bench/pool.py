@@ -15,11 +15,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any
 
 from latticebench.bench.case import Case, Folders
+from latticebench.bench.threads import ONE_THREAD
 from latticebench.bench.worker import attempt, follow_runner, outcome, ready, too_much
 
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
-)
 POLL = 0.1
 START_LIMIT = 120.0
 # A worker that died may have been the victim of something else; its case gets a second chance.

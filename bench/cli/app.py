@@ -15,6 +15,7 @@ import typer
 
 import latticebench
 from latticebench.bench.cli import compare, data, diagnose, figures, fit, limit, listing, run, schema, simulate, table
+from latticebench.bench.threads import prefer_one_thread
 from latticebench.systems.errors import InputError
 
 app = typer.Typer(
@@ -58,6 +59,7 @@ app.command(epilog=schema.EPILOG)(schema.schema)
 
 def main() -> None:
     """Run the command line; bad input is one line on standard error and exit code 2."""
+    prefer_one_thread()
     try:
         code = app(standalone_mode=False)
     except InputError as error:

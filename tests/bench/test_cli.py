@@ -426,3 +426,19 @@ def test_the_measured_pendulum_gives_its_frequency_and_damping(tmp_path: Path) -
     assert found["coefficients"]["sin(u[n])"] == pytest.approx(-64.2, rel=0.01)
     assert found["coefficients"]["v[n]"] == pytest.approx(-0.0672, rel=0.3)
     assert found["residual"] < 0.006
+
+
+def test_a_command_uses_one_thread_unless_the_environment_asks_for_more(tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.argv = ['latticebench', 'list', 'systems']\n"
+        "from latticebench.bench.cli import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "import numpy, threadpoolctl\n"
+        "print(max(pool['num_threads'] for pool in threadpoolctl.threadpool_info()))"
+    )
+    for asked, found in (({}, 1), ({"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}, 2)):
+        plain = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+        done = subprocess.run(
+            [sys.executable, "-c", program], cwd=tmp_path, env=plain | asked, capture_output=True, text=True, check=True
+        )
+        assert int(done.stdout.split()[-1]) == min(found, os.cpu_count() or 1)
