@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import json
 import shutil
 import subprocess
 import sys
@@ -55,17 +55,38 @@ def test_each_kind_of_case_depends_on_its_own_code_and_on_what_that_imports() ->
     assert not any(path.startswith("bench/trials/faults/") for path in found["recording"])
 
 
+# Changes one file of a copied package after another; keys are made of files, so that one process sees them all.
 PROGRAM = """
+import json, os, re, sys
+from pathlib import Path
+sys.path.insert(0, ".")
+from latticebench.bench import source
 from latticebench.bench.case import Folders
-from latticebench.bench.source import keys
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.trials.trial import Trial
+assert Path(source.__file__).is_relative_to(Path().resolve())
 cases = {
     "weak": FitCase(system="phi4", library="lib1", label="a", method="weak"),
     "other": FitCase(system="dnls", library="four", label="a", method="stlsq"),
     "trial": Trial(system="phi4", effect="damping"),
 }
-print(*(keys({case.identity: case}, Folders())[case.identity] for case in cases.values()))
+def keys():
+    return {name: source.keys({case.identity: case}, Folders())[case.identity] for name, case in cases.items()}
+def write(path, text, clock=iter(range(10**18, 2 * 10**18, 10**9))):
+    path.write_text(text)
+    now = next(clock)  # A file system may not tell two writes in a row apart.
+    os.utime(path, ns=(now, now))
+before, told = keys(), {}
+for name in json.loads(sys.argv[1]):
+    path = Path("latticebench") / name
+    text = path.read_text()
+    write(path, re.sub(r'^\"\"\"', '\"\"\"Differently: ', text, count=1) + "\\n# a remark\\n")
+    remark = keys()
+    write(path, text + "\\nCHANGED = True\\n")
+    changed = keys()
+    write(path, text)
+    told[name] = [[case for case in cases if found[case] != before[case]] for found in (remark, changed)]
+print(json.dumps(told))
 """
 
 
@@ -81,12 +102,6 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def keys_of(copy: Path) -> dict[str, str]:
-    program = f"import sys; sys.path.insert(0, {str(copy)!r})\n{PROGRAM}"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=copy)
-    return dict(zip(("weak", "other", "trial"), done.stdout.split(), strict=True))
-
-
 CHANGES = {
     "bench/report/page.py": set(), "bench/cli/run.py": set(), "bench/publish.py": set(), "bench/run.py": set(),
     "bench/suite.py": set(), "bench/store.py": set(), "methods/weak.py": {"weak"}, "systems/phi4.py": {"weak", "trial"},
@@ -96,14 +111,9 @@ CHANGES = {
 
 
 def test_a_change_of_a_module_runs_again_what_uses_it_and_nothing_else(copy: Path) -> None:
-    before = keys_of(copy)
-    for name, rerun in CHANGES.items():
-        path = copy / "latticebench" / name
-        text = path.read_text()
-        # A comment and another docstring change nothing.
-        path.write_text(re.sub(r'^"""', '"""Differently: ', text, count=1) + "\n# a remark\n")
-        assert keys_of(copy) == before, name
-        path.write_text(text + "\nCHANGED = True\n")
-        after = keys_of(copy)
-        path.write_text(text)
-        assert {case for case in before if before[case] != after[case]} == rerun, name
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, json.dumps(list(CHANGES))], capture_output=True, text=True, cwd=copy
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found == {name: [[], sorted(rerun, key=["weak", "other", "trial"].index)] for name, rerun in CHANGES.items()}
