@@ -16,11 +16,11 @@
     libraries = ["lib1", "lib2"]
 
     [[made]]                        # diagnoses of recordings made with a known effect: every combination of the lists
-    effects = ["catalogue", "none"] # see `bench.trials.trial.Grid`
+    effects = ["catalogue", "none"] # see `bench.trials.trial.Made`
     systems = ["phi4"]
     z = [5, 10, 30]
 
-    [[measured]]                    # the diagnosis of one measured recording, see `bench.trials.measured.Recording`
+    [[measured]]                    # the diagnosis of one measured recording, see `bench.trials.measured.Measured`
     name = "gliders"
     file = "gliders.csv"
     terms = "u[n+1]+u[n-1]-2*u[n]; u[n]"
