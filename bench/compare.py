@@ -120,10 +120,8 @@ def read_run(path: Path) -> pd.DataFrame:
         parts = [FORMS[name](kind.table(results)) for name, kind, results, _ in each(open_store(path))]
         return pd.concat(parts, ignore_index=True)
     if path.is_dir():
-        published = [path / name for name in ("cases.csv", "trials.csv") if (path / name).is_file()]
-        parts = [read_run(file) for file in published]
-        if (path / "measured.md").is_file():
-            parts.append(_reports(sorted(path.glob("*.json"))))
+        # Of a suite of several kinds each kind's tables are in a folder of their own.
+        parts = [part for folder in (path, *(path / kind for kind in FORMS)) for part in _published(folder)]
         if parts:
             return pd.concat(parts, ignore_index=True)
     if not path.is_file():
@@ -136,6 +134,14 @@ def read_run(path: Path) -> pd.DataFrame:
     if missing:
         raise InputError(f"{path}: neither a table of cases nor of trials: the column {missing[0]!r} is missing")
     return form(frame)
+
+
+def _published(folder: Path) -> list[pd.DataFrame]:
+    """Return what was published of fits, trials and recordings in a folder itself."""
+    parts = [read_run(folder / name) for name in ("cases.csv", "trials.csv") if (folder / name).is_file()]
+    if (folder / "measured.md").is_file():
+        parts.append(_reports(sorted(folder.glob("*.json"))))
+    return parts
 
 
 def of_fits(frame: pd.DataFrame) -> pd.DataFrame:

@@ -12,6 +12,7 @@ import pytest
 from latticebench import systems
 from latticebench.bench import kinds
 from latticebench.bench.case import Folders
+from latticebench.bench.compare import compare, read_run
 from latticebench.bench.run import run
 from latticebench.bench.store import create, open_store
 from latticebench.bench.suite import Suite, load
@@ -121,6 +122,9 @@ def test_one_suite_of_all_kinds_is_run_resumed_and_published(tmp_path: Path) -> 
         "out/fit/cases.csv", "out/fit/errors.tex", "out/trial/trials.csv", "out/trial/effects.csv",
         "out/trial/summary.md", "out/trial/confusion.png", "out/measured/measured.md", "out/measured/swing.json",
     }  # fmt: skip
+    with_itself = compare(read_run(tmp_path / "out"), read_run(tmp_path / "store"))
+    # The recording that was not there was not published as a report.
+    assert (with_itself.same, with_itself.gone, with_itself.fresh) == (4, [], ["gone"])
     page = (tmp_path / "out" / "measured" / "measured.md").read_text()
     assert "`swing.csv`, rows 0 to 60. Declared: without its damping (`u[n]`, order 2, ends free)." in page
     assert json.loads((tmp_path / "out" / "measured" / "swing.json").read_text()) == results[4]["report"]
