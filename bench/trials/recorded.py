@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,9 +59,18 @@ def publish(
     for result in ordered:
         if result["report"] is not None:
             path = folder / f"{result['case']['name']}.json"
-            write_text(path, json.dumps(result["report"], indent=1) + "\n")
+            write_text(path, _document(result, about))
             written.append(path)
     return written
+
+
+def _document(result: Mapping[str, Any], about: Mapping[str, Any]) -> str:
+    """Return the report on a recording as the text of a JSON file, see `latticebench schema diagnosis`."""
+    from latticebench.bench.report.content import DiagnosisDocument
+    from latticebench.bench.report.document import to_json
+
+    made = {"command": about.get("command", ""), **result["made"], "seeds": []}
+    return to_json(DiagnosisDocument.model_validate({"provenance": made, **result["report"]}))
 
 
 def draw_all(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,6 +14,7 @@ from latticebench import systems
 from latticebench.bench import kinds
 from latticebench.bench.case import Folders
 from latticebench.bench.compare import compare, read_run
+from latticebench.bench.report.schema import json_schema
 from latticebench.bench.run import run
 from latticebench.bench.store import create, open_store
 from latticebench.bench.suite import Suite, load
@@ -127,7 +129,10 @@ def test_one_suite_of_all_kinds_is_run_resumed_and_published(tmp_path: Path) -> 
     assert (with_itself.same, with_itself.gone, with_itself.fresh) == (4, [], ["gone"])
     page = (tmp_path / "out" / "measured" / "measured.md").read_text()
     assert "`swing.csv`, rows 0 to 60. Declared: without its damping (`u[n]`, order 2, ends free)." in page
-    assert json.loads((tmp_path / "out" / "measured" / "swing.json").read_text()) == results[4]["report"]
+    report = json.loads((tmp_path / "out" / "measured" / "swing.json").read_text())
+    jsonschema.validate(report, json.loads(json_schema("diagnosis")))
+    assert {"command": "", **results[4]["made"], "seeds": []} == report.pop("provenance")
+    assert {"schema": report.pop("schema"), **report} == {"schema": "latticebench/diagnosis/1", **results[4]["report"]}
 
 
 def test_a_recording_that_changed_is_diagnosed_again(tmp_path: Path) -> None:
