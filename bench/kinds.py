@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from latticebench.bench.provenance import describe
+from latticebench.bench.provenance import describe, lines
 from latticebench.bench.store import WHOLE, Shard, Store
 from latticebench.systems.errors import InputError, unknown
 
@@ -29,7 +29,7 @@ class Kind:
     Attributes:
         tables, figures: names that can be asked for.
         table: one row per case.
-        show: print results on the screen: results, their description, a title, and which score.
+        show: print results on the screen: results, and which score.
         publish: write tables: results, their description, the folder, and which tables.
         draw: the same of figures.
     """
@@ -37,7 +37,7 @@ class Kind:
     tables: Sequence[str]
     figures: Sequence[str]
     table: Callable[[Iterable[Mapping[str, Any]]], pd.DataFrame]
-    show: Callable[[Results, Mapping[str, Any], str, str], None]
+    show: Callable[[Results, str], None]
     publish: Publisher
     draw: Publisher
 
@@ -83,9 +83,16 @@ def each(
 
 
 def show(store: Store, title: str = "", value: str = "e2", shard: Shard = WHOLE) -> None:
-    """Print the results of a store."""
-    for _, kind, results, about in each(store, shard):
-        kind.show(results, about, title, value)
+    """Print the results of a store, and where they come from."""
+    from latticebench.bench.report.screen import console, show_note
+
+    found = list(each(store, shard))
+    if title:
+        console().print(title, style="bold", highlight=False)
+    for _, kind, results, _ in found:
+        kind.show(results, value)
+    for line in lines(found[0][3]):
+        show_note(line)
 
 
 def rows(store: Store, shard: Shard = WHOLE) -> list[dict[str, Any]]:
@@ -142,7 +149,7 @@ def check_figures(only: Sequence[str] | None) -> None:
 
 def _check(only: Sequence[str] | None, what: str, names: Callable[[Kind], Sequence[str]]) -> None:
     for name in only or ():
-        known = [one for kind in KINDS.values() for one in names(kind())]
+        known = list(dict.fromkeys(one for kind in KINDS.values() for one in names(kind())))
         if name not in known:
             raise unknown(what, name, known, "--only")
 

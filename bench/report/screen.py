@@ -95,23 +95,24 @@ def show_limit(limit: Limit, design: Design, note: str) -> None:
         console().print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def show_results(results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], title: str, value: str = "e2") -> None:
-    """Print a run's results: one score by data and method, what went wrong, and where the figures come from."""
-    from latticebench.bench.provenance import lines
+def show_results(results: Iterable[Mapping[str, Any]], value: str = "e2") -> None:
+    """Print the results of fits: one score by data and method, and what went wrong."""
     from latticebench.bench.publish import matrix
     from latticebench.bench.tables import cases
 
     every = cases(results)
     screen = console()
-    if title:
-        screen.print(title, style="bold", highlight=False)
     arranged = matrix(every, value)
     show_rows(list(arranged.columns), arranged.to_numpy().tolist())
     for _, row in every[~every["status"].isin(["ok", "skipped"])].iterrows():
         place = f"{row['data']} | {row['library']} | {row['method']} | seed {row['seed']}"
         screen.print(f"{row['status']}: {place}: {row['reason']}", style="red", highlight=False, markup=False)
-    for line in (f"{value}: {MEANINGS.get(value, 'median over seeds')}", *lines(about)):
-        screen.print(line, style="dim", highlight=False, markup=False)
+    show_note(f"{value}: {MEANINGS.get(value, 'median over seeds')}")
+
+
+def show_note(line: str) -> None:
+    """Print a line about what was shown."""
+    console().print(line, style="dim", highlight=False, markup=False)
 
 
 @contextmanager

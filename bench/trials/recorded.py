@@ -83,19 +83,16 @@ def draw_all(
     return []
 
 
-def show(results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], title: str = "", value: str = "") -> None:  # noqa: ARG001
+def show(results: Iterable[Mapping[str, Any]], value: str = "") -> None:  # noqa: ARG001
     """Print the verdict on each recording."""
-    from latticebench.bench.report.screen import console, show_rows
+    from latticebench.bench.report.screen import show_rows
 
-    if title:
-        console().print(title, style="bold", highlight=False)
     frame = table(results).drop(columns=["file", "terms"])
     readable = [
-        [format_number(entry) if isinstance(entry, float) else entry for entry in row] for row in frame.to_numpy()
+        ["" if entry is None else format_number(entry) if isinstance(entry, float) else entry for entry in row]
+        for row in frame.to_numpy()
     ]
     show_rows(list(frame.columns), readable)
-    for line in lines(about):
-        console().print(line, style="dim", highlight=False, markup=False)
 
 
 def _recording(result: Mapping[str, Any]) -> list[str]:

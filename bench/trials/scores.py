@@ -202,24 +202,25 @@ def _save(frame: pd.DataFrame, about: Mapping[str, Any], folder: Path) -> list[P
     return [path]
 
 
-def show(results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], title: str = "", value: str = "") -> None:  # noqa: ARG001
+def show(results: Iterable[Mapping[str, Any]], value: str = "") -> None:  # noqa: ARG001
     """Print how often the diagnosis was right."""
     from latticebench.bench.report.screen import console, show_rows
 
-    if title:
-        console().print(title, style="bold", highlight=False)
     frame = table(results)
     short = summary(frame)
-    show_rows(list(short.columns), short.to_numpy().tolist())
+    show_rows(list(short.columns), _readable(short).to_numpy().tolist())
     for _, row in frame[~frame["status"].isin(["ok", "skipped"])].iterrows():
         line = f"{row['status']}: {row['system']} {row['effect']} z={row['z']:g} seed {row['seed']}: {row['message']}"
         console().print(line, style="red", highlight=False, markup=False)
-    for line in lines(about):
-        console().print(line, style="dim", highlight=False, markup=False)
 
 
 def _markdown(frame: pd.DataFrame) -> str:
-    readable = frame.copy()
-    for name in readable.columns:
-        readable[name] = [format_number(value) if isinstance(value, float) else value for value in readable[name]]
-    return str(readable.astype(str).to_markdown(index=False, disable_numparse=True))
+    return str(_readable(frame).to_markdown(index=False, disable_numparse=True))
+
+
+def _readable(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table of texts, its numbers with two digits."""
+    shown = frame.copy()
+    for name in shown.columns:
+        shown[name] = [format_number(value) if isinstance(value, float) else value for value in shown[name]]
+    return shown.astype(str)
