@@ -16,7 +16,7 @@ PUBLISHED = Path(__file__).parents[1] / "report" / "schemas"
 def schema(
     name: Annotated[str | None, typer.Argument(help="A kind of document; without it all are listed.")] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write the schemas of all documents into this folder.")
+        Path | None, typer.Option(metavar="DIR", help="Write it, or without a name all of them, into this folder.")
     ] = None,
 ) -> None:
     """Print the JSON Schema of a document that a command writes with --json."""
@@ -24,19 +24,19 @@ def schema(
     if name is not None and name not in published:
         raise unknown("document", name, list(published))
     if out is not None:
-        _write(out)
+        _write(out, name)
     elif name is not None:
         print(published[name].read_text(encoding="utf-8"), end="")
     else:
         print("\n".join(published))
 
 
-def _write(folder: Path) -> None:
-    """Write the schemas that the documents have in this version."""
+def _write(folder: Path, name: str | None) -> None:
+    """Write the schemas that documents have in this version, or one of them."""
     from latticebench.bench.report.schema import DOCUMENTS, json_schema
     from latticebench.systems.files import write_text
 
-    for kind in DOCUMENTS:
+    for kind in DOCUMENTS if name is None else [name]:
         path = folder / f"{kind}.json"
         write_text(path, json_schema(kind))
         print(path)

@@ -66,6 +66,8 @@ def test_schemas_can_be_listed_printed_and_written(
     assert typed(monkeypatch, capsys, "schema", "fit") == json_schema("fit")
     typed(monkeypatch, capsys, "schema", "--out", str(tmp_path / "new"))
     assert (tmp_path / "new" / "limit.json").read_text() == json_schema("limit")
+    typed(monkeypatch, capsys, "schema", "fit", "--out", str(tmp_path / "one"))
+    assert [path.name for path in (tmp_path / "one").iterdir()] == ["fit.json"]
 
 
 def test_an_unknown_schema_is_refused_with_those_that_there_are(
