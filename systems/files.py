@@ -37,9 +37,9 @@ def whole(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     except OSError as error:
         remedy = "; free some space and try again" if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT) else ""
-        raise InputError(
-            f"{path}: cannot be written: {error.strerror or error}; nothing was changed{remedy}"
-        ) from error
+        # What mkdir says of a file in place of the folder would be read as if the file to be written existed.
+        reason = f"{path.parent} is no folder" if isinstance(error, FileExistsError) else error.strerror or error
+        raise InputError(f"{path}: cannot be written: {reason}; nothing was changed{remedy}") from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)

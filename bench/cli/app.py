@@ -80,7 +80,8 @@ def main() -> None:
             raise
         text = message().strip().splitlines()
         if text:
-            _complain(f"{' '.join(text)} (see: latticebench --help)")
+            command = getattr(getattr(error, "ctx", None), "command_path", app.info.name)
+            _complain(f"{' '.join(text)} (see: {command} --help)")
         code = 2
     sys.exit(code if isinstance(code, int) else 0)
 
