@@ -7,6 +7,7 @@ import itertools
 import os
 import platform
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -129,6 +130,6 @@ def lines(about: Mapping[str, Any]) -> list[str]:
     return written
 
 
-def command_line() -> list[str]:
-    """Return the arguments of this process, without the path of the program."""
-    return sys.argv[1:]
+def command_line() -> str:
+    """Return the command of this process as it would be typed."""
+    return shlex.join(["latticebench", *sys.argv[1:]])

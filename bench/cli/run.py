@@ -48,7 +48,7 @@ def run(
     folder = results if results is not None else Path("runs") / loaded.name
     store = create(folder)
     jobs = jobs or os.cpu_count() or 1
-    about = {"command": " ".join(["latticebench", *command_line()]), "suite": loaded.name, "jobs": jobs}
+    about = {"command": command_line(), "suite": loaded.name, "jobs": jobs}
     if loaded.contestants:
         about["settings"] = _contestants(loaded)
     # A cluster that ends a job says so first; that is the same as Ctrl-C.

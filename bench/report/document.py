@@ -6,7 +6,6 @@ A number that is not known (NaN) is `null` in JSON, an infinite one the text "in
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -83,7 +82,7 @@ class Pair(Content):
 
 def provenance(seeds: Sequence[int] = ()) -> Provenance:
     """Return where what this process computes comes from."""
-    return Provenance(command=shlex.join(["latticebench", *command_line()]), seeds=list(seeds), **origin())
+    return Provenance(command=command_line(), seeds=list(seeds), **origin())
 
 
 def to_json(content: Content) -> str:
