@@ -91,32 +91,32 @@ def _everywhere(fitted: Fitted) -> list[tuple[str | None, str, float, sympy.Expr
     found: list[tuple[str | None, str, float, sympy.Expr]] = [
         (None, text, value, expression(text)) for text, value in zip(texts, values[: len(texts)], strict=True)
     ]
-    for change, block in zip(fitted.model.effects, blocks(fitted), strict=True):
-        if change.effect.acts in ("one site", "every site") or change.as_force:
+    for placed, block in zip(fitted.model.effects, blocks(fitted), strict=True):
+        if placed.effect.acts in ("one site", "every site") or placed.as_force:
             continue
-        named = [_text(change, label) for label in labels(change, fitted)]
-        pieces = zip(named, values[block], bodies(change) if named else [], strict=True)
-        found += [(change.effect.name, text, value, body) for text, value, body in pieces]
+        named = [_text(placed, label) for label in labels(placed, fitted)]
+        pieces = zip(named, values[block], bodies(placed) if named else [], strict=True)
+        found += [(placed.effect.name, text, value, body) for text, value, body in pieces]
     return found
 
 
-def _text(change: PlacedEffect, label: str) -> str:
+def _text(placed: PlacedEffect, label: str) -> str:
     """Return a label so that it can stand in a product."""
     lead = "i*" if label.startswith("i*") else ""
-    if change.effect.acts == "delayed":
-        return f"{lead}u[n](t-{change.psi['delay']:.4g})"
-    if change.effect.acts == "long range":
-        return f"{lead}sum((u[n+r]+u[n-r]-2*u[n])/r**{change.psi['s']:.3g}, r>=2)"
+    if placed.effect.acts == "delayed":
+        return f"{lead}u[n](t-{placed.psi['delay']:.4g})"
+    if placed.effect.acts == "long range":
+        return f"{lead}sum((u[n+r]+u[n-r]-2*u[n])/r**{placed.psi['s']:.3g}, r>=2)"
     return label
 
 
-def bodies(change: PlacedEffect) -> list[sympy.Expr]:
+def bodies(placed: PlacedEffect) -> list[sympy.Expr]:
     """Return what each coefficient of an effect that acts at every site is multiplied with."""
     import sympy
 
-    acts, psi = change.effect.acts, change.psi
+    acts, psi = placed.effect.acts, placed.psi
     t = sympy.Symbol("t", real=True)
-    terms = [expression(text) for text in change.texts]
+    terms = [expression(text) for text in placed.texts]
     if acts == "harmonic":
         phase = sympy.Float(psi["omega"], 6) * t
         return [wave(phase) * term for term in terms for wave in (sympy.cos, sympy.sin)]
@@ -148,32 +148,32 @@ def _pulse(t: sympy.Symbol, at: float, width: float) -> sympy.Expr:
 def _elsewhere(fitted: Fitted) -> list[str]:
     """Return what acts at single sites, at the ends and on the readings, one sentence each."""
     found = []
-    for change, block in zip(fitted.model.effects, blocks(fitted), strict=True):
+    for placed, block in zip(fitted.model.effects, blocks(fitted), strict=True):
         values = [float(value) for value in fitted.solution.state.coefficients[block]]
-        if change.effect.acts in INSTRUMENT:
-            found += _misread(change, values, fitted.data[0].is_complex)
-        elif change.effect.acts == "ends":
-            found.append(f"the ends are {change.ends}")
+        if placed.effect.acts in INSTRUMENT:
+            found += _misread(placed, values, fitted.data[0].is_complex)
+        elif placed.effect.acts == "ends":
+            found.append(f"the ends are {placed.ends}")
         else:
-            found += _local(change, values)
+            found += _local(placed, values)
     return found
 
 
-def _local(change: PlacedEffect, values: list[float]) -> list[str]:
+def _local(placed: PlacedEffect, values: list[float]) -> list[str]:
     """Return what an effect does that acts at one site, or differently at each."""
-    acts = change.effect.acts
-    if acts == "one site" and change.site is not None:
-        return [f"site {change.site + 1} alone has {text_of_sum(change.texts, values)} besides"]
-    if acts == "one equation" and change.site is not None:
-        factor = 1 + change.psi["scale"]
+    acts = placed.effect.acts
+    if acts == "one site" and placed.site is not None:
+        return [f"site {placed.site + 1} alone has {text_of_sum(placed.texts, values)} besides"]
+    if acts == "one equation" and placed.site is not None:
+        factor = 1 + placed.psi["scale"]
         return [
-            f"site {change.site + 1}: its whole right-hand side is multiplied by {factor:.{DIGITS}g} "
+            f"site {placed.site + 1}: its whole right-hand side is multiplied by {factor:.{DIGITS}g} "
             f"(a mass of {1 / factor:.{DIGITS}g} times the others')"
         ]
     if acts == "every site":
-        each = np.reshape(values, (len(change.texts), -1))
-        named = " and ".join(change.texts)
-        if change.psi.get("whole"):
+        each = np.reshape(values, (len(placed.texts), -1))
+        named = " and ".join(placed.texts)
+        if placed.psi.get("whole"):
             about = f"mean {np.mean(each):.3g}, standard deviation {np.std(each):.3g}"
         else:
             each = np.concatenate([each, -np.sum(each, axis=1, keepdims=True)], axis=1)
@@ -184,18 +184,18 @@ def _local(change: PlacedEffect, values: list[float]) -> list[str]:
     return []
 
 
-def _misread(change: PlacedEffect, values: list[float], is_complex: bool) -> list[str]:
+def _misread(placed: PlacedEffect, values: list[float], is_complex: bool) -> list[str]:
     """Return what the instrument makes of the readings."""
-    acts, psi = change.effect.acts, change.psi
-    if change.as_force and len(values) <= LISTED:
+    acts, psi = placed.effect.acts, placed.psi
+    if placed.as_force and len(values) <= LISTED:
         return [f"site {number} alone has {value:.{DIGITS}g} besides" for number, value in enumerate(values, start=1)]
-    if change.as_force:
+    if placed.as_force:
         return [f"every site has a constant force of its own: {_rms(values):.{DIGITS}g} (RMS)"]
     if acts == "rounding":
         return [f"readings are rounded to multiples of {psi['step']:.{DIGITS}g}"]
-    if len(change.free) <= LISTED:
-        return [f"{reading(change, name, is_complex)}: {psi[name]:.{DIGITS}g}" for name in change.free]
-    size = _rms([psi[name] for name in change.free])
+    if len(placed.free) <= LISTED:
+        return [f"{reading(placed, name, is_complex)}: {psi[name]:.{DIGITS}g}" for name in placed.free]
+    size = _rms([psi[name] for name in placed.free])
     return [f"{acts} of every {'row' if acts == 'clock' else 'site'}: {size:.{DIGITS}g} (RMS)"]
 
 

@@ -43,35 +43,35 @@ def added(diagnosis: Diagnosis) -> tuple[AddedEffect, ...]:
     errors = np.sqrt(np.maximum(np.diag(fitted.solution.covariance), 0.0))
     found = []
     pieces = zip(fitted.model.effects, blocks(fitted), course.equal, strict=True)
-    for number, (change, block, equal) in enumerate(pieces):
-        names = labels(change, fitted)
+    for number, (placed, block, equal) in enumerate(pieces):
+        names = labels(placed, fitted)
         coefficients = dict(zip(names, map(float, fitted.solution.state.coefficients[block]), strict=True))
         stderr = dict(zip(names, map(float, errors[block]), strict=True))
         known = fitted.psi_errors[number] if number < len(fitted.psi_errors) else {}
-        parameters: dict[str, bool | int | float | str] = {} if change.site is None else {"site": change.site + 1}
-        if change.ends:
-            parameters["ends"] = change.ends
-        for name, value in change.psi.items():
+        parameters: dict[str, bool | int | float | str] = {} if placed.site is None else {"site": placed.site + 1}
+        if placed.ends:
+            parameters["ends"] = placed.ends
+        for name, value in placed.psi.items():
             if name in ("inner", "origin"):
                 # Of use to the fit alone.
                 continue
-            if change.effect.acts in INSTRUMENT and name in change.free:
-                label = reading(change, name, fitted.data[0].is_complex)
+            if placed.effect.acts in INSTRUMENT and name in placed.free:
+                label = reading(placed, name, fitted.data[0].is_complex)
                 coefficients[label] = float(value)
             else:
                 label = name
                 parameters[name] = bool(value) if name == "open" else int(value) if name == "reach" else float(value)
             if name in known:
                 stderr[label] = float(known[name])
-        if change.effect.acts == "one equation":
+        if placed.effect.acts == "one equation":
             # The force is what it was; the site answers it as a mass of this size would.
-            ratio = 1 / (1 + float(change.psi["scale"]))
+            ratio = 1 / (1 + float(placed.psi["scale"]))
             parameters["mass_ratio"] = ratio
             if "scale" in stderr:
                 stderr["mass_ratio"] = stderr["scale"] * ratio**2
         found.append(
             AddedEffect(
-                effect=change.effect.name, parameters=parameters, coefficients=coefficients, stderr=stderr,
+                effect=placed.effect.name, parameters=parameters, coefficients=coefficients, stderr=stderr,
                 indistinguishable=equal,
             )
         )  # fmt: skip
@@ -93,30 +93,30 @@ def blocks(fitted: Fitted) -> list[slice]:
     """Return which coefficients of a fit are those of each added effect."""
     samples = fitted.data[0]
     begin, found = len(fitted.model.declared.terms), []
-    for change in fitted.model.effects:
-        end = begin + len(change.forces(samples.sites, samples.is_complex))
+    for placed in fitted.model.effects:
+        end = begin + len(placed.forces(samples.sites, samples.is_complex))
         found.append(slice(begin, end))
         begin = end
     return found
 
 
-def labels(change: PlacedEffect, fitted: Fitted) -> list[str]:
+def labels(placed: PlacedEffect, fitted: Fitted) -> list[str]:
     """Return a text for each coefficient of an added effect."""
     samples = fitted.data[0]
-    found = [force.label for force in change.forces(samples.sites, samples.is_complex)]
+    found = [force.label for force in placed.forces(samples.sites, samples.is_complex)]
     # A force that is i times 1.
     return [label.removesuffix("*1") if label.endswith("i*1") else label for label in found]
 
 
-def reading(change: PlacedEffect, name: str, is_complex: bool) -> str:
+def reading(placed: PlacedEffect, name: str, is_complex: bool) -> str:
     """Return what a parameter of the instrument is, with the names of the file's columns."""
     kind, _, number = name.partition("_")
-    if change.effect.acts == "clock":
+    if placed.effect.acts == "clock":
         return f"lateness of row {number}" if kind == "row" else "slowness of the clock"
-    if is_complex and change.effect.acts == "offset":
+    if is_complex and placed.effect.acts == "offset":
         column = f"{'im' if kind == 'imaginary' else 're'}{number}"
     elif is_complex:
         column = f"re{number} and im{number}"
     else:
-        column = f"u{number}" + (f" and v{number}" if change.both else "")
-    return f"{change.effect.acts} of {column}"
+        column = f"u{number}" + (f" and v{number}" if placed.both else "")
+    return f"{placed.effect.acts} of {column}"

@@ -74,7 +74,7 @@ def _parts(field: np.ndarray) -> np.ndarray:
 
 def _of_the_rounds(diagnosis: Diagnosis) -> Iterator[str]:
     course = diagnosis.course
-    kept = {change.effect.name for change in course.after.model.effects}
+    kept = {placed.effect.name for placed in course.after.model.effects}
     gone = list(dict.fromkeys(one.added for one in course.rounds if one.added and one.added not in kept))
     if gone:
         yield f"Added in a round and taken away again, since later ones do without: {', '.join(gone)}."
@@ -114,5 +114,5 @@ def _of_the_names(diagnosis: Diagnosis) -> Iterator[str]:
             "natural logarithms of the likelihood ratio), though it is no effect of the catalogue: the name is in "
             "doubt."
         )
-    if any(change.effect.acts == "clock" for change in course.after.model.effects):
+    if any(placed.effect.acts == "clock" for placed in course.after.model.effects):
         yield "How late a row to come will be read cannot be known: the forecast is for the times as they are told."

@@ -29,13 +29,13 @@ def separations(diagnosis: Diagnosis) -> tuple[Separation, ...]:
     course = diagnosis.course
     model, is_complex = course.after.model, course.after.data[0].is_complex
     effects = {entry.name: entry.screened.placed.effect for one in course.rounds for entry in one.ranking}
-    effects |= {change.effect.name: change.effect for change in model.effects}
+    effects |= {placed.effect.name: placed.effect for placed in model.effects}
     return tuple(
         Separation(
-            effect=change.effect.name, other=name,
-            measurement=separation(change.effect, effects[name], model.order, is_complex),
+            effect=placed.effect.name, other=name,
+            measurement=separation(placed.effect, effects[name], model.order, is_complex),
         )
-        for change, equal in zip(model.effects, course.equal, strict=True)
+        for placed, equal in zip(model.effects, course.equal, strict=True)
         for name in equal
     )  # fmt: skip
 
