@@ -1,4 +1,4 @@
-"""Measured recordings that the loop is tried on: what they are, who made them, and how to know a true copy.
+"""Measured recordings that the diagnosis is tried on: what they are, who made them, and how to know a true copy.
 
 None of them is part of this project, whose licence is not theirs. A user who has one takes a local copy of it; its
 SHA-256 says that it is the one that the published results are of.

@@ -1,4 +1,4 @@
-"""How it is found: the protocol of a method, and one file a method."""
+"""How it is found: the protocol of a method, and one file per method."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def diagnose(
     """Find what a declared equation lacks: trace its residual to an effect, add it, show the error before and after."""
     from latticebench import methods
     from latticebench.bench.report.screen import watching
-    from latticebench.diagnosis.repair import diagnose as close_the_loop
+    from latticebench.diagnosis.repair import diagnose as diagnose_data
     from latticebench.methods.method import make, solve
     from latticebench.systems.effects import CATALOGUE
     from latticebench.systems.readers import read_all
@@ -87,7 +87,7 @@ def diagnose(
     with told(data, method, "the diagnosis"), watching() as watcher, redirect_stdout(sys.stderr):
         fit = None if method is None else solve(make(methods.find(method), {}), data, declared, order, seed)
         start = None if fit is None else fit.coefficients
-        found = close_the_loop(declared, order, data, catalogue, seed, held_out=later, watcher=watcher, start=start)
+        found = diagnose_data(declared, order, data, catalogue, seed, held_out=later, watcher=watcher, start=start)
     _report(found, seed, json_out, html_out)
 
 

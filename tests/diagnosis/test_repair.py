@@ -1,4 +1,4 @@
-"""The loop: it names what is missing, adds it and nothing else, and says so when it does not know."""
+"""The diagnosis names what is missing, adds it and nothing else, and says so when it does not know."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ GLIDERS = Path(__file__).parents[4] / "shared" / "data" / "measured" / "gliders.
 
 @functools.cache
 def looped(name, effect, z=30, seed=1, sites=9):
-    """A specimen, the loop's course on it, and the true noise on u and v, each real part."""
+    """A specimen, the course of the search on it, and the true noise on u and v, each real part."""
     system = systems.find(name)
     draw = np.random.default_rng(seed)
     specimen = make(system, effect, z, draw, Conditions(sites=sites, samples=40, span=8.0, variation=True))

@@ -127,7 +127,7 @@ def test_making_one_does_not_call_the_dynamics_that_fits_use(monkeypatch):
     from latticebench.bench.trials import specimen
 
     def forbidden(*_, **__):
-        raise AssertionError("the loop's dynamics was used")
+        raise AssertionError("the dynamics of the diagnosis was used")
 
     class Guess:
         """Any change has the size 15."""
