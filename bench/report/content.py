@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Verdict = Literal["nothing missing", "explained", "partly explained", "unexplained"]
 
 
-class Recording(Content):
+class RecordingSummary(Content):
     """What was looked at.
 
     Attributes:
@@ -124,7 +124,7 @@ class Report(Content):
 
     verdict: Verdict
     sentence: str
-    recording: Recording
+    recording: RecordingSummary
     declared: dict[str, Number]
     declared_before: dict[str, Number]
     declared_stderr: dict[str, Number]
@@ -193,9 +193,9 @@ def _sentence(verdict: str, found: tuple[AddedEffect, ...]) -> str:
     return f"What the equation lacks: {listed}. Something more is left that nothing in the catalogue explains."
 
 
-def _recording(diagnosis: Diagnosis) -> Recording:
+def _recording(diagnosis: Diagnosis) -> RecordingSummary:
     data = diagnosis.course.after.data
-    return Recording(
+    return RecordingSummary(
         sources=tuple(dict.fromkeys(samples.source for samples in data)), sites=data[0].sites,
         rows=sum(len(samples.t) for samples in data),
         trajectories=len(scaled_residuals(diagnosis.course.after, diagnosis)),

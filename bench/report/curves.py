@@ -36,7 +36,7 @@ class ResidualCurve:
 
 
 @dataclass(frozen=True, eq=False)
-class Residuals:
+class WorstResidual:
     """The residual where it is largest: one trajectory, and of u and v the one that shows more.
 
     Attributes:
@@ -60,7 +60,7 @@ class Residuals:
 
 
 @dataclass(frozen=True, eq=False)
-class Forecasts:
+class WorstForecast:
     """The forecasts of the trajectory and site that the declared equation predicts worst.
 
     Attributes:
@@ -81,19 +81,19 @@ class Forecasts:
 
 
 @dataclass(frozen=True, eq=False)
-class Curves:
+class PictureCurves:
     """What is drawn of a diagnosis."""
 
-    residual: Residuals
-    forecast: Forecasts
+    residual: WorstResidual
+    forecast: WorstForecast
 
 
-def curves(diagnosis: Diagnosis) -> Curves:
+def curves(diagnosis: Diagnosis) -> PictureCurves:
     """Return what is drawn of a diagnosis."""
-    return Curves(_residuals(diagnosis), _forecasts(diagnosis))
+    return PictureCurves(_residuals(diagnosis), _forecasts(diagnosis))
 
 
-def _residuals(diagnosis: Diagnosis) -> Residuals:
+def _residuals(diagnosis: Diagnosis) -> WorstResidual:
     course = diagnosis.course
     before = scaled_residuals(course.before, diagnosis)
     number = int(np.argmax([float(np.nanmean(values**2)) for _, values in before]))
@@ -106,19 +106,19 @@ def _residuals(diagnosis: Diagnosis) -> Residuals:
         return ResidualCurve(t, values[:, level], omega, power)
 
     after = scaled_residuals(course.after, diagnosis)[number] if course.after.model.effects else None
-    return Residuals(
+    return WorstResidual(
         "uv"[level], number + 1, len(before), curve(*before[number]), None if after is None else curve(*after)
     )
 
 
-def _forecasts(diagnosis: Diagnosis) -> Forecasts:
+def _forecasts(diagnosis: Diagnosis) -> WorstForecast:
     before, after = (_joined(side) for side in diagnosis.forecasts)
     moving = diagnosis.course.after.records[0].stretches.dynamics.moving
     # A forecast that ran away is the worst; a site that was not read cannot be.
     sizes = [np.nan_to_num(forecast_error(one, moving, (0, 1)), nan=-1.0, posinf=1e300) for one in before]
     number = int(np.argmax([np.max(size) for size in sizes]))
     first = range(before[number].seen.shape[-1])[moving][0]
-    return Forecasts(
+    return WorstForecast(
         number + 1, len(before), first + int(np.argmax(sizes[number])) + 1, before[number],
         after[number] if diagnosis.course.after.model.effects else None, moving, float(diagnosis.noise[0]),
     )  # fmt: skip

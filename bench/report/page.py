@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from latticebench.bench.provenance import lines
 from latticebench.bench.report import pictures, rows
 from latticebench.bench.report.content import Ranked, Report, Turn
-from latticebench.bench.report.curves import Curves
+from latticebench.bench.report.curves import PictureCurves
 from latticebench.bench.report.document import Provenance
 from latticebench.systems.files import write_text
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import jinja2
 
 
-def write_page(report: Report, curves: Curves, about: Provenance | None, path: Path) -> None:
+def write_page(report: Report, curves: PictureCurves, about: Provenance | None, path: Path) -> None:
     """Write the page of a diagnosis, whole or not at all.
 
     Args:
@@ -35,7 +35,7 @@ def write_page(report: Report, curves: Curves, about: Provenance | None, path: P
     write_text(path, page(report, curves, about))
 
 
-def page(report: Report, curves: Curves, about: Provenance | None = None) -> str:
+def page(report: Report, curves: PictureCurves, about: Provenance | None = None) -> str:
     """Return the page of a diagnosis; the arguments are those of `write_page`."""
     frequencies = [one.parameters["omega"] for one in report.effects if "omega" in one.parameters]
     environment = _environment()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.bench.report.curves import Curves, Forecasts, ResidualCurve, forecast_error
+from latticebench.bench.report.curves import PictureCurves, ResidualCurve, WorstForecast, forecast_error
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +29,7 @@ MAPPED = 4
 WIDTH, HEIGHT = 5.0, 3.0
 
 
-def draw(curves: Curves, frequencies: Sequence[float]) -> dict[str, str]:
+def draw(curves: PictureCurves, frequencies: Sequence[float]) -> dict[str, str]:
     """Return the pictures of a diagnosis as SVG elements, by name: maps, spectrum, forecast and its growth.
 
     Args:
@@ -192,7 +192,7 @@ def spectrum(lines: Sequence[tuple[str, np.ndarray, np.ndarray]], found: Sequenc
     return _svg(figure, "spectrum")
 
 
-def prediction(shown: Forecasts) -> str:
+def prediction(shown: WorstForecast) -> str:
     """Draw the readings of one site and what the equations predict for it."""
     site = shown.site - 1
     figure, axes = _axes()
@@ -218,7 +218,7 @@ def prediction(shown: Forecasts) -> str:
     return _svg(figure, "forecast")
 
 
-def growth(shown: Forecasts) -> str:
+def growth(shown: WorstForecast) -> str:
     """Draw how the error of the forecast over all sites grows, in units of the noise."""
     figure, axes = _axes()
     highest = 1.0

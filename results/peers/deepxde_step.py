@@ -111,7 +111,7 @@ def deepxde(mode: str, *, each: bool = False) -> Callable[[int], float]:
     return train
 
 
-class Contestant(NamedTuple):
+class Training(NamedTuple):
     """One way to train: its name, how it differentiates, and the steps of a short and a long training."""
 
     name: str
@@ -129,12 +129,12 @@ class Contestant(NamedTuple):
 def measured(rounds: int) -> pd.DataFrame:
     """Measure the contestants in turn, and return the median, smallest and largest milliseconds per step of each."""
     contestants = [
-        Contestant("latticebench pinn", "one forward tangent, one backward pass", ours(), 200, 2200),
-        Contestant(
+        Training("latticebench pinn", "one forward tangent, one backward pass", ours(), 200, 2200),
+        Training(
             "DeepXDE as its examples", "as below, and one PointSetBC per output", deepxde("reverse", each=True), 2, 6
         ),
-        Contestant("DeepXDE", "reverse mode, its default: one backward pass per output", deepxde("reverse"), 2, 12),
-        Contestant(
+        Training("DeepXDE", "reverse mode, its default: one backward pass per output", deepxde("reverse"), 2, 12),
+        Training(
             "DeepXDE, forward mode",
             "set_default_autodiff('forward'): one pass for all outputs",
             deepxde("forward"),
