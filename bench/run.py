@@ -70,8 +70,7 @@ def run(
     store.plan(keys, about or {})
     made = origin()
     before = store.finished()
-    cases = dict(zip(keys.values(), suite.cases, strict=True))
-    wanted = dict(itertools.islice(cases.items(), shard.first - 1, None, shard.step))
+    wanted = dict(itertools.islice(zip(keys.values(), suite.cases, strict=True), shard.first - 1, None, shard.step))
     waiting = [case for key, case in wanted.items() if key not in before or not _counts(case, *before[key], retry)]
     tally = Tally(reused=len(wanted) - len(waiting))
     if watcher is not None:
@@ -95,6 +94,7 @@ def run(
 
     if waiting:
         execute(waiting, suite.folders, jobs=jobs, begin=begin, keep=keep)
+    store.forget_replaced()
     store.relabel(_renamed(wanted, store.finished() if waiting else before))
     tally.statuses = store.statuses(shard)
     return store.results(shard), tally

@@ -101,7 +101,7 @@ class Store:
             )
 
     def plan(self, keys: Mapping[str, str], about: Mapping[str, Any]) -> None:
-        """Record which suite is run, and remove what an older source made of its cases.
+        """Record which suite is run.
 
         Args:
             keys: of the cases, by their identities.
@@ -116,15 +116,23 @@ class Store:
             )
             cursor.execute("DELETE FROM temp.suite")
             cursor.executemany("INSERT INTO temp.suite VALUES (?, ?, ?)", rows)
-            cursor.execute(
-                "DELETE FROM results WHERE key IN (SELECT results.key FROM temp.suite AS planned "
-                "JOIN results USING (identity) WHERE results.key <> planned.key)"
-            )
             cursor.execute("DELETE FROM main.suite")
             cursor.execute("INSERT INTO main.suite SELECT place, key FROM temp.suite")
             cursor.execute("DELETE FROM about")
             cursor.executemany(
                 "INSERT INTO about VALUES (?, ?)", [(name, json.dumps(value)) for name, value in about.items()]
+            )
+
+    def forget_replaced(self) -> None:
+        """Remove what another source made of the planned cases, where there is a result of the planned one.
+
+        So a run that is stopped, or is of a shard alone, takes nothing away that it has not made anew.
+        """
+        with self._writing() as cursor:
+            cursor.execute(
+                "DELETE FROM results WHERE key IN (SELECT old.key FROM temp.suite AS planned "
+                "JOIN results AS fresh ON fresh.key = planned.key "
+                "JOIN results AS old ON old.identity = planned.identity WHERE old.key <> planned.key)"
             )
 
     def relabel(self, cases: Mapping[str, Case]) -> None:

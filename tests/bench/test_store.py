@@ -73,14 +73,21 @@ def test_histories_are_read_only_where_they_are_asked_for(tmp_path: Path) -> Non
     assert [one["history"] for one in store.results(history=True)] == [{"step": [1.0]}]
 
 
-def test_a_plan_forgets_what_an_older_source_made_of_its_cases_and_nothing_else(tmp_path: Path) -> None:
+def test_what_an_older_source_made_is_forgotten_once_it_is_made_anew_and_nothing_else(tmp_path: Path) -> None:
+    def keys() -> list[str]:
+        return [key for (key,) in store.read("SELECT key FROM results ORDER BY key")]
+
     store = create(tmp_path / "store")
-    other = CASE.model_copy(update={"seed": 2})
-    store.put("old", CASE, result(), MADE)
-    store.put("kept", other, result(), MADE)
-    store.plan({CASE.identity: "new"}, {})
-    store.plan({other.identity: "kept", CASE.identity: "old"}, {})
+    other, third = (CASE.model_copy(update={"seed": seed}) for seed in (2, 3))
+    for key, case in (("old", CASE), ("kept", other), ("old, too", third)):
+        store.put(key, case, result(), MADE)
+    store.plan({CASE.identity: "new", other.identity: "kept", third.identity: "never made"}, {})
+    store.forget_replaced()
+    assert keys() == ["kept", "old", "old, too"]
     assert set(store.finished()) == {"kept"}
+    store.put("new", CASE, result(), MADE)
+    store.forget_replaced()
+    assert keys() == ["kept", "new", "old, too"]
 
 
 def test_a_run_goes_by_its_own_plan_whatever_another_one_plans_on_the_same_store(tmp_path: Path) -> None:
