@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from latticebench.bench.report.mathematics import written
@@ -201,5 +201,7 @@ def progress_bar(total: int) -> Iterator[Bar]:
             return Text(escape(task.fields["running"]), style="dim", overflow="ellipsis", no_wrap=True)
 
     columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeRemainingColumn(), Running())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    progress = Progress(*columns, console=Console(stderr=True), transient=True)
+    # Without a terminal there is no bar to be drawn, and an empty line would be left at its end.
+    with progress if progress.console.is_terminal else nullcontext():
         yield Bar(progress, progress.add_task("cases", total=total, running=""), total)
