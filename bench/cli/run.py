@@ -54,7 +54,7 @@ def run(
     # A cluster that ends a job says so first; that is the same as Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with progress_bar(len(loaded.cases)) as watcher:
+        with progress_bar(len(loaded.cases[part.first - 1 :: part.step])) as watcher:
             found, tally = run_suite(loaded, store, jobs=jobs, retry=retry, shard=part, watcher=watcher, about=about)
     except KeyboardInterrupt:
         print(
