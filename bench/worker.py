@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import threading
@@ -36,6 +37,8 @@ def attempt(case: Case, folders: Folders) -> dict[str, Any]:
         # What a method prints is for people, not for a program that reads the result.
         with memory_limit(case.memory_limit), redirect_stdout(sys.stderr):
             case.run(folders, found)
+        # What a method of the user's returns may be anything; a result is what JSON can hold.
+        json.dumps(found, allow_nan=False)
     except Skipped as skipped:
         return outcome(case, "skipped", str(skipped), found)
     except MemoryError:
@@ -44,7 +47,7 @@ def attempt(case: Case, folders: Folders) -> dict[str, Any]:
         if "allocate memory" in str(error) or "Unable to allocate" in str(error):
             return outcome(case, "memory", too_much(case), found)
         text = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        return outcome(case, "failed", text, found)
+        return outcome(case, "failed", text, found if _is_json(found) else None)
     return outcome(case, "ok", "", found)
 
 
@@ -55,6 +58,14 @@ def outcome(case: Case, status: str, reason: str = "", found: Mapping[str, Any] 
         "reason": " ".join(reason.split())[:MAX_REASON],
         **(case.blank() if found is None else found),
     }
+
+
+def _is_json(found: Mapping[str, Any]) -> bool:
+    try:
+        json.dumps(found, allow_nan=False)
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return True
 
 
 def too_much(case: Case) -> str:

@@ -115,7 +115,7 @@ class Fit:
         smooth: the curves of each trajectory, where the method fits curves and coefficients together.
 
     Raises:
-        ValueError: the coefficients do not match the library.
+        ValueError: the coefficients do not match the library, or are not real.
     """
 
     method: str
@@ -133,11 +133,17 @@ class Fit:
     smooth: tuple[Smooth, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check that there is one coefficient per term."""
+        """Check that there is one real coefficient per term."""
         expected = (len(self.library.terms),)
         for name, array in (("coefficients", self.coefficients), ("stderr", self.stderr)):
-            if array is not None and np.shape(array) != expected:
+            if array is None:
+                continue
+            if np.shape(array) != expected:
                 raise ValueError(f"{self.method}: {name} have shape {np.shape(array)}, the library {expected}")
+            if np.iscomplexobj(array):
+                raise ValueError(
+                    f"{self.method}: {name} must be real; a complex coefficient of T is those of T and i*T"
+                )
 
 
 class Method(Protocol):

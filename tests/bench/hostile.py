@@ -51,6 +51,10 @@ class Hostile:
             data[0].t[:] *= 2
         if self.deed == "nan":
             return Fit(self.name, library, order, np.full(len(library.terms), np.nan), 0.0)
+        if self.deed == "complex":
+            return Fit(self.name, library, order, np.zeros(len(library.terms)) + 1j, 0.0)
+        if self.deed == "object":
+            return Fit(self.name, library, order, np.ones(len(library.terms)), 0.0, status=object())  # type: ignore[arg-type]
         time.sleep(self.seconds)
         draw = np.random.default_rng(seed)
         return Fit(self.name, library, order, draw.normal(size=len(library.terms)), 0.5)

@@ -78,12 +78,13 @@ def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other
         {
             "good": 'deed = "behave"', "failing": 'deed = "fail"', "eating": 'deed = "eat"',
             "hanging": 'deed = "hang in C"', "dying": 'deed = "die"', "empty": 'deed = "nan"', "slow": "seconds = 0.5",
+            "imaginary": 'deed = "complex"', "odd": 'deed = "object"',
         },
         seeds="[1, 2]", limits={"hanging": "time_limit = 2", "eating": f"{LONG}\nmemory_limit = 1500"},
     )  # fmt: skip
     results, tally = finished(suite, create(tmp_path / "store"), jobs=2)
     found = {(r["case"]["label"], r["case"]["seed"]): r for r in results}
-    assert len(found) == tally.ran == 14
+    assert len(found) == tally.ran == 18
     for seed in (1, 2):
         assert found["good", seed]["status"] == found["slow", seed]["status"] == "ok"
         assert found["failing", seed]["status"] == "failed"
@@ -95,6 +96,9 @@ def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other
         assert found["dying", seed]["status"] == "died"
         assert found["empty", seed]["status"] == "failed"
         assert "not finite" in found["empty", seed]["reason"]
+        assert found["imaginary", seed]["status"] == found["odd", seed]["status"] == "failed"
+        assert "real" in found["imaginary", seed]["reason"]
+        assert "JSON" in found["odd", seed]["reason"]
 
 
 def test_finished_cases_are_not_run_again_and_failures_only_when_asked(tmp_path: Path) -> None:
