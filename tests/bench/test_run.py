@@ -167,7 +167,13 @@ def start_run() -> Iterator[StartRun]:
     with ExitStack() as ends:
 
         def start(suite: Path, store: Path) -> subprocess.Popen[bytes]:
-            command = [sys.executable, "-m", "latticebench", "run", str(suite), "--results", str(store), "--jobs", "2"]
+            # A shell that starts tests in the background makes their children deaf to Ctrl-C.
+            program = (
+                "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+                "from latticebench.bench.cli import main; main()"
+            )
+            options = ["run", str(suite), "--results", str(store), "--jobs", "2"]
+            command = [sys.executable, "-c", program, *options]
             runner = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
             ends.enter_context(runner)
             ends.callback(end_group if os.name == "posix" else lambda _: runner.kill(), runner.pid)
