@@ -62,10 +62,13 @@ def run(
             file=sys.stderr,
         )
         raise
+    title = loaded.title
+    # What is shown is read from the store; a hundred thousand cases need not be held beside it.
+    del loaded, watcher
     if as_json:
         print(document(store, part), end="")
         return
-    kinds.show(store, loaded.title, shard=part)
+    kinds.show(store, title, shard=part)
     statuses = ", ".join(f"{count} {status}" for status, count in tally.statuses.items())
     print(f"{len(found)} cases ({statuses}); {tally.ran} run now, {tally.reused} were there; kept in {folder}")
 
