@@ -75,6 +75,16 @@ class Term:
         return symbolic(self.text)
 
     @property
+    def in_decimals(self) -> sympy.Expr:
+        """The SymPy expression with decimals in the place of fractions."""
+        import sympy
+
+        def decimal(value: sympy.Rational) -> sympy.Expr:
+            return sympy.Float(value, 6)
+
+        return self.expression.replace(lambda part: part.is_Rational and not part.is_Integer, decimal)
+
+    @property
     def latex(self) -> str:
         """The term in LaTeX, without dollar signs."""
         import sympy

@@ -55,14 +55,9 @@ def expression(text: str) -> sympy.Expr:
     Raises:
         TermError: the text is not in the term language.
     """
-    import sympy
-
     from latticebench.systems.terms import Term
 
-    def decimal(value: sympy.Rational) -> sympy.Expr:
-        return sympy.Float(value, 6)
-
-    return Term(text).expression.replace(lambda part: part.is_Rational and not part.is_Integer, decimal)
+    return Term(text).in_decimals
 
 
 def latex(body: sympy.Expr) -> str:

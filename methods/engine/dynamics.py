@@ -135,12 +135,11 @@ class Dynamics:
             InputError: a term uses f[n], and there is no input.
         """
         windows = self._windows(y, t, f, driven)
-        bundle = self._values
         shape = (len(t), self.count)
         values = np.empty((self.parts, len(self.terms), *shape))
-        flat = values.reshape(-1, *shape)
-        for k, value in enumerate(bundle.function(*(windows(slot) for slot in bundle.slots))):
-            flat[k] = value
+        for term, bundle in enumerate(self._values):
+            for part, value in enumerate(bundle.function(*(windows(slot) for slot in bundle.slots))):
+                values[part, term] = value
         if self.weights is not None:
             values *= self.weights[:, None, self.moving]
         factors = self._factors(t)
@@ -165,15 +164,17 @@ class Dynamics:
         factors: dict[int, ndarray],
     ) -> None:
         """Add to `found` the derivatives of all terms by the variables of the stencil, times their coefficients."""
-        slopes, places = self._partials
-        outputs = slopes.function(*(windows(slot) for slot in slopes.slots)) if places else ()
-        for (term, part, slot), value in zip(places, outputs, strict=True):
-            share = coefficients[term] * value
-            if self.weights is not None:
-                share = share * self.weights[term, self.moving]
-            if term in factors:
-                share = share * factors[term][part]
-            found[part, slot] = found[part, slot] + share if (part, slot) in found else share
+        for term, (slopes, places) in enumerate(self._partials):
+            if not places or coefficients[term] == 0:
+                continue
+            outputs = slopes.function(*(windows(slot) for slot in slopes.slots))
+            for (_, part, slot), value in zip(places, outputs, strict=True):
+                share = coefficients[term] * value
+                if self.weights is not None:
+                    share = share * self.weights[term, self.moving]
+                if term in factors:
+                    share = share * factors[term][part]
+                found[part, slot] = found[part, slot] + share if (part, slot) in found else share
 
     @functools.cached_property
     def _rubbing(self) -> tuple[int, ...]:
@@ -219,11 +220,12 @@ class Dynamics:
 
     @functools.cached_property
     def _values(self) -> Any:
-        return compiled(tuple(term.text for term in self.terms), self.is_complex)
+        # Each term is compiled once, whatever the equation that it stands in.
+        return [compiled((term.text,), self.is_complex) for term in self.terms]
 
     @functools.cached_property
     def _partials(self) -> Any:
-        return partials(tuple(term.text for term in self.terms), self.is_complex)
+        return [partials((term.text,), self.is_complex) for term in self.terms]
 
     @functools.cached_property
     def ghosts(self) -> tuple[Int[ndarray, " padded"], Float[ndarray, " padded"]]:

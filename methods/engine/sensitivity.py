@@ -18,7 +18,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -69,6 +69,8 @@ class Stretches:
         inputs: function that maps times (B,) to the measured input f (B, N), or None.
         drive: B-splines that the sites without an equation follow, or None where every site has one.
         held: whether the drive is known, so that nothing is derived by it.
+        integrator: the Runge-Kutta method of order 8 with 12 stages, or the one of order 5 with 6, both of Dormand and
+            Prince; the latter is faster where the samples are dense.
     """
 
     dynamics: Dynamics
@@ -77,6 +79,7 @@ class Stretches:
     inputs: Input | None = None
     drive: BSplines | None = None
     held: bool = False
+    integrator: Literal["dop853", "rk45"] = "dop853"
 
     def joins(self, other: Stretches) -> bool:
         """Whether both can be integrated as one: they follow one equation, without inputs or a drive."""
@@ -158,16 +161,23 @@ class Stretches:
         start: Float[ndarray, "stretch state"],
         substeps: Int[ndarray, " stretch"],
         splines: ndarray | None = None,
+        *,
+        by_terms: bool = True,
     ) -> Transition:
-        """Return the ends of all stretches with their derivatives by the start, the coefficients and the drive."""
+        """Return the ends of all stretches with their derivatives by the start, the coefficients and the drive.
+
+        Without `by_terms` the derivatives by the coefficients are left out: `by_coefficient` is (K, 0, S).
+        """
         dynamics = self.dynamics
         far = 4 * max(1, *dynamics.reach)
         while (colours := self._colours(far)) < dynamics.count:
-            found = self.vary_in_groups(coefficients, start, substeps, splines, colours, far)
+            found = self.vary_in_groups(coefficients, start, substeps, splines, colours, far, by_terms=by_terms)
             if found is not None:
                 return found
             far *= 2
-        found = self.vary_in_groups(coefficients, start, substeps, splines, dynamics.count, dynamics.count)
+        found = self.vary_in_groups(
+            coefficients, start, substeps, splines, dynamics.count, dynamics.count, by_terms=by_terms
+        )
         assert found is not None
         return found
 
@@ -187,6 +197,8 @@ class Stretches:
         splines: ndarray | None,
         colours: int,
         far: int,
+        *,
+        by_terms: bool = True,
     ) -> Transition | None:
         """Do the work of `vary` with the sites in groups, those of each disturbed together.
 
@@ -197,6 +209,7 @@ class Stretches:
             splines: see `vary`.
             colours: number of groups; site n belongs to group n modulo `colours`.
             far: farthest sites, counted from the disturbed one, that are looked at.
+            by_terms: see `vary`.
 
         Returns:
             the transition, or None if a disturbance gets farther than `far` sites.
@@ -204,7 +217,7 @@ class Stretches:
         dynamics = self.dynamics
         size, count, blocks = dynamics.size, dynamics.count, dynamics.order * dynamics.parts
         states = blocks * colours
-        terms = len(dynamics.terms)
+        terms = len(dynamics.terms) if by_terms else 0
         extra = 0
         if self.drive is not None and not self.held:
             extra = self._active[1] * dynamics.parts * len(dynamics.border)
@@ -222,8 +235,11 @@ class Stretches:
             for number in np.unique(substeps):
                 alike = np.flatnonzero(substeps == number)
                 for chosen in np.split(alike, np.arange(chunk, len(alike), chunk)):
-                    varied = np.broadcast_to(seeds, (len(chosen), *seeds.shape))
-                    end[chosen], z = self._march(coefficients, chosen, start[chosen], varied, int(number), splines)
+                    varied = np.broadcast_to(seeds[:, :, None], (*seeds.shape, len(chosen)))
+                    end[chosen], z = self._march(
+                        coefficients, chosen, start[chosen], varied, int(number), splines, by_terms=by_terms
+                    )
+                    z = np.moveaxis(z, -1, 0)
                     by_state[chosen] = z[:, :states]
                     by_coefficient[chosen] = z[:, states : states + terms]
                     if by_drive is not None:
@@ -242,11 +258,11 @@ class Stretches:
         z: ndarray | None,
         count: int,
         splines: ndarray | None,
+        *,
+        by_terms: bool = True,
     ) -> tuple[ndarray, Any]:
-        """Take `count` steps with the states y (B, S) and, if given, their derivatives z (B, columns, S)."""
-        from scipy.integrate import DOP853
-
-        a, b, c = DOP853.A, DOP853.B, DOP853.C
+        """Take `count` steps with the states y (B, S) and, if given, their derivatives z (columns, S, B)."""
+        a, b, c = self._tableau
         begin = self.begin[chosen]
         h = (self.end[chosen] - begin) / count
         slopes_y = np.empty((len(b), *y.shape))
@@ -258,7 +274,7 @@ class Stretches:
                 if stage:
                     at_y = y + h[:, None] * _combine(a[stage, :stage], slopes_y)
                     if z is not None:
-                        at_z = z + h[:, None, None] * _combine(a[stage, :stage], slopes_z)
+                        at_z = z + h * _combine(a[stage, :stage], slopes_z)
                 f = None if self.inputs is None else self.inputs(t)
                 driven = self.driven(t, splines)
                 rate, values, slopes = self.dynamics.linear(
@@ -266,10 +282,10 @@ class Stretches:
                 )
                 slopes_y[stage] = rate
                 if slopes_z is not None:
-                    self._vary_rate(slopes_z[stage], at_z, values, slopes, t, chosen)
+                    self._vary_rate(slopes_z[stage], at_z, values, slopes, t, chosen, by_terms=by_terms)
             y = y + h[:, None] * _combine(b, slopes_y)
             if z is not None:
-                z = z + h[:, None, None] * _combine(b, slopes_z)
+                z = z + h * _combine(b, slopes_z)
         return y, z
 
     def _vary_rate(
@@ -280,13 +296,21 @@ class Stretches:
         slopes: dict[tuple[int, Slot], ndarray],
         t: ndarray,
         chosen: ndarray,
+        *,
+        by_terms: bool,
     ) -> None:
-        """Write d/dt of the derivatives z (B, columns, S) into `out`."""
+        """Write d/dt of the derivatives z (columns, S, B) into `out`.
+
+        The batch is the last axis, so that the innermost loops are long even on short chains.
+        """
         dynamics = self.dynamics
         order, parts, count = dynamics.order, dynamics.parts, dynamics.count
-        terms = len(dynamics.terms)
-        field = dynamics.whole(z, None)
-        extra = 0
+        columns, terms = len(z), len(dynamics.terms)
+        blocks = z.reshape(columns, order, parts, count, len(t))
+        field, extra = blocks, 0
+        if len(dynamics.border):
+            field = np.zeros((columns, order, parts, dynamics.sites, len(t)))
+            field[..., dynamics.moving, :] = blocks
         if self.drive is not None and not self.held:
             first, width = self._active
             border = dynamics.border
@@ -297,20 +321,36 @@ class Stretches:
             # The columns of the drive: spline coefficient, part, site.
             for part in range(parts):
                 for number, site in enumerate(border):
-                    column = z.shape[1] - extra + (place * parts + part) * len(border) + number
+                    column = columns - extra + (place * parts + part) * len(border) + number
                     for level in range(order):
-                        field[rows, column, level, part, site] = curves[level]
-        padded = dynamics.padded(field)
-        target = out.reshape(*z.shape[:2], order, parts, count)
+                        field[column, level, part, site, rows] = curves[level]
+        padded = self._padded(field)
+        target = out.reshape(columns, order, parts, count, len(t))
         if order == 2:
-            target[:, :, 0] = z.reshape(target.shape)[:, :, 1]
-        target[:, :, -1] = 0.0
+            target[:, 0] = blocks[:, 1]
+        target[:, -1] = 0.0
         for (part, slot), slope in slopes.items():
             begin = dynamics.reach[0] + slot.offset
-            window = padded[:, :, int(slot.name == "v"), int(slot.part == "im"), begin : begin + count]
-            target[:, :, -1, part] += (slope[:, None, :] if np.ndim(slope) == 2 else slope) * window
-        own = z.shape[1] - extra - terms
-        target[:, own : own + terms, -1] += np.transpose(values, (2, 1, 0, 3))
+            window = padded[:, int(slot.name == "v"), int(slot.part == "im"), begin : begin + count]
+            target[:, -1, part] += (np.atleast_2d(slope).T if np.ndim(slope) else slope) * window
+        if by_terms:
+            own = columns - extra - terms
+            target[own : own + terms, -1] += np.transpose(values, (1, 0, 3, 2))
+
+    def _padded(self, field: ndarray) -> ndarray:
+        """Extend the last axis but one, the N sites, by what the ends repeat."""
+        index, factor = self.dynamics.ghosts
+        if self.dynamics.ends != "unknown":
+            field = np.take(field, index, axis=-2)
+        return field if np.all(factor == 1) else field * factor[:, None]
+
+    @functools.cached_property
+    def _tableau(self) -> tuple[ndarray, ndarray, ndarray]:
+        """The coefficients of the integrator."""
+        from scipy.integrate import DOP853, RK45
+
+        method = DOP853 if self.integrator == "dop853" else RK45
+        return method.A, method.B, method.C
 
 
 def _combine(weights: ndarray, slopes: ndarray | None) -> ndarray:
