@@ -1,130 +1,447 @@
-"""How far a model is followed from one initial state, and which samples of a long record are looked at."""
+"""How a model is followed: over pieces of recordings, side by side, each from an initial state of its own.
+
+The motion between neighbouring samples is integrated for all samples at once, from states near it; Newton steps along
+each piece then make every state the end of the motion from the one before (multiple shooting with its defects
+closed; Bock, Springer Ser. Chem. Phys. 18, 102 (1981)).
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from latticebench.diagnosis.model import Fitted, Model, carried, cut, first_fit
-from latticebench.diagnosis.polish import polish
-from latticebench.diagnosis.residual import noise_of_readings, residual_rms
-from latticebench.methods.engine.dynamics import split_parts
-from latticebench.systems.samples import Samples
+from latticebench.diagnosis.acting import Chain
+from latticebench.diagnosis.model import Assembled, Model
+from latticebench.diagnosis.noise import Rows
+from latticebench.diagnosis.problem import Problem
+from latticebench.methods.engine.dynamics import Dynamics
+from latticebench.methods.engine.record import Record
+from latticebench.methods.engine.sensitivity import Stretches, Transition
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    import scipy.sparse
+    from jaxtyping import Bool, Float, Int
     from numpy import ndarray
 
-# A residual of more than so many times the noise is gross: the model is then followed over shorter pieces.
-GROSS = 3.0
-MOST_PIECES = 64
-LONGEST = 4000
-MOST_SAMPLES = 16_000
-# Thinning leaves at least so many samples.
-ENOUGH = 2000
+# Newton steps that may close the gaps of a motion, how small the last one must be in units of a small size, and how
+# large one may be at most.
+CLOSURES, CLOSED, LOST = 6, 1.0, 1e6
+# Steps with derivatives from nearby must be so many times smaller: they do not square what is left.
+CHORD = 0.1
+MOST_SUBSTEPS = 256
+# A piece of fewer rows says nothing.
+FEWEST_ROWS = 3
+# What the errors of all intervals of a piece may come to together, in units of a small size.
+TOGETHER = 3.0
+# Noise is at least this share of a converter's step: where a motion stands still, readings repeat exactly.
+ROUNDING = 0.2
+# Pieces of more intervals are propagated in blocks where there are few of them.
+LONG_PIECE, FEW_PIECES = 200, 32
+# Newton steps that undo what instruments do, and the least slope of a reading that can be undone.
+UNREAD, LEAST_SLOPE = 6, 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Horizon:
-    """How far the model is followed without a new start: as far as it can go without losing the readings.
+class Layout:
+    """How recordings are cut into pieces.
 
     Attributes:
-        data: the whole trajectories.
-        noise: of the readings, estimated from them alone; NaN where that cannot be done.
-        lengths: of pieces in samples, from whole trajectories down.
+        chain: the lattice.
+        plain: the declared terms on it.
+        records: the recordings.
+        splines: of the sites without an equation, of each recording.
+        rows: which rows of its recording each piece has (pieces, m); the last is repeated where a piece is shorter.
+        valid: whether a row is none of those repeated.
+        substeps: of the integrator, for each interval (pieces * (m - 1)).
+        integrator: the one that needs the least work.
+        least: the smallest size of the noise.
+        small: a size of u that does not matter.
     """
 
-    data: tuple[Samples, ...]
-    noise: Float[ndarray, " levels"]
-    lengths: tuple[int, ...]
+    chain: Chain
+    plain: Dynamics
+    records: tuple[Record, ...]
+    splines: tuple[ndarray | None, ...]
+    rows: tuple[Int[ndarray, "pieces m"], ...]
+    valid: tuple[Bool[ndarray, "pieces m"], ...]
+    substeps: tuple[Int[ndarray, " intervals"], ...]
+    small: float
+    integrator: Literal["dop853", "rk45"] = "dop853"
+    least: float = 0.0
 
     @classmethod
-    def of(cls, data: Sequence[Samples], model: Model) -> Horizon:
-        """Return the horizon of recordings: the lengths of pieces from which a model's parameters can be told."""
-        longest = max(len(samples.t) for samples in data)
-        if sum(len(samples.t) for samples in data) > MOST_SAMPLES:
-            # Of a very long record evenly spaced parts are enough.
-            parts = cut(data, LONGEST)
-            data = [parts[k] for k in np.linspace(0, len(parts) - 1, MOST_SAMPLES // LONGEST).astype(int)]
-            longest = LONGEST
-        levels = 1 if model.order == 1 or data[0].v is None else 2
-        least = max(4 * model.order // levels + 2, -(-sum(len(samples.t) for samples in data) // MOST_PIECES))
-        lengths = [min(longest, LONGEST)]
-        while lengths[-1] / 3 >= least:
-            lengths.append(-(-lengths[-1] // 3))
-        return cls(tuple(data), noise_of_readings(data, model.order, levels), tuple(lengths))
+    def of(cls, problem: Problem, length: int, most: int | None, small: float) -> Layout:
+        """Cut recordings into pieces of about `length` rows; of `most` rows in all, evenly spaced, if that is given."""
+        found_rows, found_valid = [], []
+        total = sum(len(record.times) for record in problem.records)
+        for record in problem.records:
+            pieces = _pieces(record.times, length, length * problem.step)
+            if most is not None and most < total:
+                kept = max(1, round(len(pieces) * most / total))
+                pieces = [pieces[k] for k in np.unique(np.linspace(0, len(pieces) - 1, kept).round().astype(int))]
+            m = max(end - begin for begin, end in pieces)
+            found_rows.append(np.stack([np.minimum(begin + np.arange(m), end - 1) for begin, end in pieces]))
+            found_valid.append(np.stack([begin + np.arange(m) < end for begin, end in pieces]))
+        substeps = tuple(np.ones(rows.shape[0] * (rows.shape[1] - 1), dtype=int) for rows in found_rows)
+        return cls(
+            problem.chain, problem.plain, problem.records, problem.splines, tuple(found_rows), tuple(found_valid),
+            substeps, small, least=ROUNDING * min((one for one in problem.steps if one > 0), default=0.0),
+        )  # fmt: skip
 
-    def follows(self, fitted: Fitted) -> bool:
-        """Return whether a model stays near the readings."""
-        if not fitted.solution.converged:
-            return False
-        if not np.all(np.isfinite(self.noise)):
-            return True
-        return residual_rms(fitted, self.noise) < GROSS
+    @property
+    def pieces(self) -> int:
+        """The number of pieces of all recordings."""
+        return sum(len(rows) for rows in self.rows)
 
-    def sees_all(self, fitted: Fitted) -> bool:
-        """Return whether a model follows the readings from end to end.
+    @property
+    def longest(self) -> int:
+        """The samples of the longest piece."""
+        return int(max(rows.shape[1] for rows in self.rows))
 
-        Only then do small differences between terms mean something.
-        """
-        return self.follows(fitted) and max(len(samples.t) for samples in fitted.data) >= self.lengths[0]
+    def readings(self) -> int:
+        """Return how many numbers were read."""
+        pairs = zip(self.records, self.rows, self.valid, strict=True)
+        return int(sum(np.sum(record.seen[rows][valid]) for record, rows, valid in pairs))
 
-    def first(self, model: Model, start: Float[ndarray, " terms"] | None = None) -> Fitted:
-        """Return the fit to the longest pieces that a model can follow; to the shortest ones where it follows none."""
-        for length in self.lengths:
-            last = length == self.lengths[-1]
-            fitted = first_fit(model, cut(self.data, length), steps=40 if last else 15, coefficients=start)
-            if self.follows(fitted):
-                break
-        return fitted
+    def laid_out(self) -> Rows:
+        """Return times and sensors of all rows, one after another."""
+        times = np.concatenate([r.times[rows].ravel() for r, rows in zip(self.records, self.rows, strict=True)])
+        first = np.concatenate([np.arange(rows.size) % rows.shape[1] == 0 for rows in self.rows])
+        sensor = np.arange(self.chain.levels)[:, None, None] * self.chain.sites + np.arange(self.chain.sites)
+        whole = np.broadcast_to(sensor, (self.chain.levels, self.chain.parts, self.chain.sites))
+        return Rows(times, first, whole.ravel(), self.least)
 
-    def lengthen(self, fitted: Fitted) -> Fitted:
-        """Return the fit to the longest pieces that a model follows, from a fit to shorter ones."""
-        present = max(len(samples.t) for samples in fitted.data)
-        for length in reversed(self.lengths):
-            if length <= present:
-                continue
-            pieces = cut(self.data, length)
-            longer = polish(
-                fitted.model,
-                replace(fitted, data=tuple(pieces), solution=replace(fitted.solution, state=carried(fitted, pieces))),
-            )
-            if longer is None or not self.follows(longer):
-                break
-            fitted = longer
-        return fitted
+    def stretches(self, number: int, assembled: Assembled) -> Stretches:
+        """Return the intervals of all pieces of one recording."""
+        record = self.records[number]
+        t = record.times[self.rows[number]]
+        ends = t[:, :-1].ravel(), t[:, 1:].ravel()
+        return replace(
+            record.stretches,
+            dynamics=assembled.dynamics,
+            begin=ends[0],
+            end=ends[1],
+            held=True,
+            integrator=self.integrator,
+        )
+
+    def with_substeps(self, model: Model, nodes: Sequence[ndarray], top: float) -> Layout:
+        """Return the same with the integrator that needs the least work near given states, and its steps."""
+        short, long = (replace(self, integrator=way)._steps(model, nodes, top) for way in ("rk45", "dop853"))
+        work = [stages * sum(int(np.sum(one)) for one in steps) for stages, steps in ((6, short), (12, long))]
+        if work[0] < work[1]:
+            return replace(self, substeps=short, integrator="rk45")
+        return replace(self, substeps=long, integrator="dop853")
+
+    def _steps(self, model: Model, nodes: Sequence[ndarray], top: float) -> tuple[Int[ndarray, " intervals"], ...]:
+        found = []
+        for number in range(len(self.records)):
+            assembled = model.assembled(self.plain, self.chain, number)
+            y = nodes[number]
+            # Errors add up along a piece; a slow loss of amplitude would be taken for a damping.
+            least = self.small * min(0.3, TOGETHER / y.shape[1])
+            levels = [least, least * top][: self.plain.order]
+            tolerance = np.repeat(levels, assembled.dynamics.parts * assembled.dynamics.count)
+            flat = y[:, :-1].reshape(-1, y.shape[-1])
+            stretches = self.stretches(number, assembled)
+            needed = stretches.substeps(assembled.coefficients, flat, tolerance, self.splines[number])
+            found.append(np.minimum(needed, MOST_SUBSTEPS))
+        return tuple(found)
 
 
-def thinned(samples: Samples, order: int) -> Samples:
-    """Return samples without those that a cubic spline through the others gives to within the noise.
+def _pieces(times: Float[ndarray, " time"], length: int, longest: float) -> list[tuple[int, int]]:
+    """Return the first row of each piece and the one after its last; of several, none holds a gap beyond `longest`."""
+    count, found = len(times), []
+    gaps = np.flatnonzero(np.diff(times) > longest) + 1 if length < count else np.array([], dtype=int)
+    for begin, end in itertools.pairwise([0, *gaps.tolist(), count]):
+        edges = np.linspace(begin, end, max(1, round((end - begin) / length)) + 1).round().astype(int).tolist()
+        found += [piece for piece in itertools.pairwise(edges) if piece[1] - piece[0] > FEWEST_ROWS]
+    return found or [(0, count)]
 
-    Nothing is left out where an input was measured, too.
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A motion along all pieces, and what it leaves of the readings.
+
+    Attributes:
+        model: with its numbers.
+        nodes: states at the rows of each recording's pieces (pieces, m, S).
+        level: the model's readings, rows of all recordings one after another (rows, channels).
+        left: readings less that, NaN where nothing was read.
+        own: derivatives of the readings by the field (rows, channels).
     """
-    step = 1
-    levels = 1 if order == 1 or samples.v is None else 2
-    size = noise_of_readings([samples], order, levels)[0]
-    while samples.f is None and np.isfinite(size) and len(samples.t) // (2 * step) >= ENOUGH:
-        if _left_by_spline(samples, 2 * step) > 1.5 * size:
-            break
-        step *= 2
-    if step == 1:
-        return samples
-    u, v = samples.u[::step], None if samples.v is None else samples.v[::step]
-    return replace(samples, t=samples.t[::step], u=u, v=v)
+
+    model: Model
+    nodes: tuple[Float[ndarray, "pieces m state"], ...]
+    level: Float[ndarray, "rows channels"]
+    left: Float[ndarray, "rows channels"]
+    own: Float[ndarray, "rows channels"]
+
+    @property
+    def size(self) -> int:
+        """The length S of a state."""
+        return int(self.nodes[0].shape[-1])
 
 
-def _left_by_spline(samples: Samples, step: int) -> float:
-    """Return the RMS of what a cubic spline through every `step`-th sample leaves of the others, per real part."""
-    from scipy.interpolate import CubicSpline
+@dataclass(frozen=True, eq=False)
+class Followed(Path):
+    """A motion with its derivatives.
 
-    left = []
-    for part in np.moveaxis(split_parts(samples.u, samples.is_complex).reshape(len(samples.t), -1), 1, 0):
-        seen = np.isfinite(part)
-        t, value = samples.t[seen], part[seen]
-        if len(t) < 4 * step:
-            return float("inf")
-        left.append(value - CubicSpline(t[::step], value[::step])(t))
-    return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
+    Attributes:
+        moves: of the nodes, by the piece's initial state and the model's numbers (pieces, m, S + G, S).
+        transitions: of each state by the one before (pieces, m - 1, S, S).
+        slope: of the readings, by the initial state and the numbers (rows, channels, S + G).
+    """
+
+    moves: tuple[Float[ndarray, "pieces m varied state"], ...]
+    transitions: tuple[Float[ndarray, "pieces intervals state state"], ...]
+    slope: Float[ndarray, "rows channels varied"]
+
+
+def follow(
+    model: Model,
+    layout: Layout,
+    near: Sequence[Float[ndarray, "pieces m state"]],
+    transitions: Sequence[Float[ndarray, "pieces intervals state state"]] | None = None,
+) -> Path | None:
+    """Follow a model from the first state of each piece; None where it cannot be followed.
+
+    Args:
+        model: with its numbers.
+        layout: the pieces.
+        near: states near the motion, of each recording.
+        transitions: the derivatives of each state by the one before, of a motion nearby if there is one.
+    """
+    nodes = []
+    with np.errstate(all="ignore"):
+        for number in range(len(layout.records)):
+            assembled = model.assembled(layout.plain, layout.chain, number)
+            gaps = _Gaps.of(layout, number, assembled)
+            closed = None if transitions is None else gaps.closed_along(near[number], transitions[number])
+            closed = gaps.closed(near[number]) if closed is None else closed
+            if closed is None:
+                return None
+            nodes.append(closed)
+    return Path(model, tuple(nodes), *_readings(model, layout, nodes))
+
+
+def linearised(path: Path, layout: Layout) -> Followed | None:
+    """Return a motion with its derivatives; None where they are not finite."""
+    moves, transitions = [], []
+    with np.errstate(all="ignore"):
+        for number, y in enumerate(path.nodes):
+            assembled = path.model.assembled(layout.plain, layout.chain, number)
+            flat = y[:, :-1].reshape(-1, y.shape[-1])
+            found = layout.stretches(number, assembled).vary(
+                assembled.coefficients, flat, layout.substeps[number], layout.splines[number]
+            )
+            by_state = _dense(found.by_state).reshape(*y[:, 1:].shape, y.shape[-1])
+            moves.append(_moves(found, by_state, assembled))
+            transitions.append(by_state)
+    if not all(np.all(np.isfinite(one)) for one in moves):
+        return None
+    slope = _slopes(path, layout, moves)
+    return Followed(path.model, path.nodes, path.level, path.left, path.own, tuple(moves), tuple(transitions), slope)
+
+
+def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "time state"]) -> ndarray:
+    """Return states whose readings by a model's instruments are given states.
+
+    Args:
+        model: whose instruments are undone.
+        layout: the recordings.
+        number: of the recording.
+        nodes: smoothed readings as states, at all its times.
+    """
+    if not model.instruments():
+        return nodes
+    record, chain = layout.records[number], layout.chain
+    t, driven = record.times, record.stretches.driven(record.times, layout.splines[number])
+    reading = layout.plain.whole(nodes, driven)
+    field = reading.copy()
+    for _ in range(UNREAD):
+        rate = np.zeros_like(field)
+        rate[:, :-1] = field[:, 1:]
+        level, own = field[:, : chain.levels], np.ones_like(field[:, : chain.levels])
+        for placed, _ in model.instruments():
+            wrong = placed.misread(t, field[:, : chain.levels], rate[:, : chain.levels])
+            level, own = level + wrong.added, own + wrong.slope
+        own = np.where(np.abs(own) > LEAST_SLOPE, own, 1.0)
+        field[:, : chain.levels] += (reading[:, : chain.levels] - level) / own
+    if chain.levels < field.shape[1]:
+        field[:, 1] = reading[:, 1] / own[:, 0]
+    return np.asarray(field[..., layout.plain.moving].reshape(nodes.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class _Gaps:
+    """The gaps between the states of one recording's pieces and where the motion from the state before leads."""
+
+    layout: Layout
+    number: int
+    assembled: Assembled
+    stretches: Stretches
+    units: Float[ndarray, " state"]
+
+    @classmethod
+    def of(cls, layout: Layout, number: int, assembled: Assembled) -> _Gaps:
+        dynamics, record = assembled.dynamics, layout.records[number]
+        levels = [layout.small, layout.small / float(np.median(np.diff(record.times)))][: dynamics.order]
+        units = np.repeat(levels, dynamics.parts * dynamics.count)
+        return cls(layout, number, assembled, layout.stretches(number, assembled), units)
+
+    def closed_along(self, near: ndarray, by_state: ndarray) -> ndarray | None:
+        """Return states that follow one another, by steps with given derivatives; None where these are too far off."""
+        y, last = np.array(near), np.inf
+        for _ in range(CLOSURES):
+            start = y[:, :-1].reshape(-1, y.shape[-1])
+            ends = self.stretches.run(
+                self.assembled.coefficients, start, self.layout.substeps[self.number], self.layout.splines[self.number]
+            )
+            y, worst = self._moved(y, ends, by_state)
+            if worst < CLOSED * CHORD:
+                return y
+            if not worst < last / 2:
+                return None
+            last = worst
+        return None
+
+    def closed(self, near: ndarray) -> ndarray | None:
+        """Return states that follow one another, by Newton steps; None where these do not lead there."""
+        y = np.array(near)
+        for _ in range(CLOSURES):
+            start = y[:, :-1].reshape(-1, y.shape[-1])
+            found = self.stretches.vary(
+                self.assembled.coefficients, start, self.layout.substeps[self.number], self.layout.splines[self.number],
+                by_terms=False,
+            )  # fmt: skip
+            y, worst = self._moved(y, found.end, _dense(found.by_state))
+            # Newton steps square what is left.
+            if worst < CLOSED:
+                return y
+            if not worst < LOST:
+                break
+        return None
+
+    def _moved(self, y: ndarray, ends: ndarray, by_state: ndarray) -> tuple[ndarray, float]:
+        """Return states after a step that closes the gaps as far as the motion is linear, and the largest change."""
+        pieces, m, size = y.shape
+        gaps = (ends.reshape(pieces, m - 1, size) - y[:, 1:])[:, :, None]
+        by_state = by_state.reshape(pieces, m - 1, size, size)
+        change = propagate(by_state, gaps, np.zeros((pieces, 1, size)))[:, :, 0]
+        worst = float(np.max(np.abs(change) / self.units))
+        return y + change, worst if np.isfinite(worst) else np.inf
+
+
+def _dense(by_state: ndarray | Sequence[scipy.sparse.csr_array]) -> ndarray:
+    return by_state if isinstance(by_state, np.ndarray) else np.stack([one.toarray() for one in by_state])
+
+
+def _moves(transition: Transition, by_state: ndarray, assembled: Assembled) -> ndarray:
+    """Return the derivatives of all states by the initial one and by the model's numbers."""
+    pieces, intervals, size, _ = by_state.shape
+    forced = np.tensordot(transition.by_coefficient, assembled.slope, (1, 0))
+    count = forced.shape[2]
+    wide = np.zeros((pieces, intervals, size + count, size))
+    wide[:, :, size:] = np.moveaxis(forced, 1, 2).reshape(pieces, intervals, count, size)
+    first = np.zeros((pieces, size + count, size))
+    first[:, :size] = np.eye(size)
+    return propagate(by_state, wide, first)
+
+
+def propagate(
+    by_state: Float[ndarray, "pieces intervals state state"],
+    forced: Float[ndarray, "pieces intervals columns state"],
+    first: Float[ndarray, "pieces columns state"],
+) -> Float[ndarray, "pieces m columns state"]:
+    """Return z_{j+1} = z_j by_state_j + forced_j, beginning with `first`.
+
+    Long pieces are worked on in blocks side by side, which are joined afterwards.
+    """
+    pieces, intervals, size = by_state.shape[:3]
+    if intervals > LONG_PIECE and pieces < FEW_PIECES:
+        return _in_blocks(by_state, forced, first)
+    z = np.empty((pieces, intervals + 1, first.shape[1], size))
+    z[:, 0] = first
+    for j in range(intervals):
+        z[:, j + 1] = z[:, j] @ by_state[:, j] + forced[:, j]
+    return z
+
+
+def _in_blocks(by_state: ndarray, forced: ndarray, first: ndarray) -> ndarray:
+    pieces, intervals, size = by_state.shape[:3]
+    columns, length = first.shape[1], round(intervals**0.5)
+    blocks = -(-intervals // length)
+    spare = blocks * length - intervals
+    still = np.broadcast_to(np.eye(size), (pieces, spare, size, size))
+    through = np.concatenate([by_state, still], axis=1).reshape(pieces * blocks, length, size, size)
+    push = np.concatenate([forced, np.zeros((pieces, spare, columns, size))], axis=1)
+    wide = np.concatenate(
+        [np.zeros((pieces * blocks, length, size, size)), push.reshape(-1, length, columns, size)], axis=2
+    )
+    begin = np.concatenate([np.eye(size), np.zeros((columns, size))])
+    own = propagate(through, wide, np.broadcast_to(begin, (pieces * blocks, *begin.shape)))
+    own = own.reshape(pieces, blocks, length + 1, size + columns, size)
+    starts = np.empty((pieces, blocks, columns, size))
+    starts[:, 0] = first
+    for k in range(blocks - 1):
+        starts[:, k + 1] = starts[:, k] @ own[:, k, -1, :size] + own[:, k, -1, size:]
+    z = starts[:, :, None] @ own[:, :, :, :size] + own[:, :, :, size:]
+    inner = z[:, :, :-1].reshape(pieces, blocks * length, columns, size)
+    return np.asarray(np.concatenate([inner, z[:, -1:, -1]], axis=1)[:, : intervals + 1])
+
+
+def fields(layout: Layout, number: int, nodes: Float[ndarray, "pieces m state"]) -> tuple[ndarray, ndarray, ndarray]:
+    """Return times (rows,), the field (rows, order, parts, N), and its time derivative as far as the state tells it."""
+    record = layout.records[number]
+    t = record.times[layout.rows[number]].ravel()
+    driven = record.stretches.driven(t, layout.splines[number])
+    field = layout.plain.whole(nodes.reshape(t.size, -1), driven)
+    rate = np.zeros_like(field)
+    rate[:, :-1] = field[:, 1:]
+    return t, field, rate
+
+
+def _readings(model: Model, layout: Layout, nodes: Sequence[ndarray]) -> tuple[ndarray, ndarray, ndarray]:
+    """Return what instruments make of a motion, what that leaves of the readings, and its derivative by the field."""
+    levels, lefts, owns = [], [], []
+    for number, record in enumerate(layout.records):
+        rows = layout.rows[number]
+        t, field, rate = _seen(layout, number, nodes[number])
+        level, own = field, np.ones_like(field)
+        for placed, _ in model.instruments():
+            wrong = placed.misread(t, field, rate)
+            level, own = level + wrong.added, own + wrong.slope
+        seen = record.seen[rows] & layout.valid[number][..., None, None, None]
+        value = np.where(seen, record.value[rows], np.nan).reshape(level.shape)
+        shape = (rows.size, -1)
+        levels.append(level.reshape(shape))
+        lefts.append((value - level).reshape(shape))
+        owns.append(own.reshape(shape))
+    return np.concatenate(levels), np.concatenate(lefts), np.concatenate(owns)
+
+
+def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
+    """Return the derivatives of the readings by the initial state and the model's numbers."""
+    found, begin = [], 0
+    for number, rows in enumerate(layout.rows):
+        t, field, rate = _seen(layout, number, path.nodes[number])
+        count, size = moves[number].shape[2:]
+        flat = moves[number].reshape(rows.size, count, size)
+        by = np.moveaxis(layout.plain.whole(flat, None)[:, :, : layout.chain.levels], 1, -1)
+        by = by.reshape(rows.size, -1, count) * path.own[begin : begin + rows.size, :, None]
+        begin += rows.size
+        for placed, block in path.model.instruments():
+            wrong = np.moveaxis(placed.misread(t, field, rate).by, 0, -1)
+            by[..., size + block.start : size + block.stop] += wrong.reshape(rows.size, by.shape[1], -1)
+        found.append(by)
+    return np.concatenate(found)
+
+
+def _seen(layout: Layout, number: int, nodes: ndarray) -> tuple[ndarray, ndarray, ndarray]:
+    t, field, rate = fields(layout, number, nodes)
+    return t, field[:, : layout.chain.levels], rate[:, : layout.chain.levels]

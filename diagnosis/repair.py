@@ -1,26 +1,24 @@
-"""The diagnosis of recordings: the search for what an equation lacks, and the errors before and after it."""
+"""The diagnosis of recordings: what an equation lacks, and the errors before and after it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from latticebench.diagnosis.contest import Watcher
-from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.residual import (
-    Prediction,
-    alike,
-    dynamics_share,
-    noise_of_fit,
-    pooled,
-    predict,
-    residual_rms,
-)
-from latticebench.diagnosis.search import Course, search
+from latticebench.diagnosis import modes, rules
+from latticebench.diagnosis.finding import Compared, Finding, compared, findings
+from latticebench.diagnosis.fitting import Fitted
+from latticebench.diagnosis.forecast import Prediction, pooled, predict
+from latticebench.diagnosis.horizon import unread
+from latticebench.diagnosis.instrument import describe
+from latticebench.diagnosis.modes import Mode
+from latticebench.diagnosis.problem import Problem, derivative_share
+from latticebench.diagnosis.search import Found, Horizon, Search, Watcher
+from latticebench.diagnosis.unnamed import Left, left_in
 from latticebench.methods.method import check_fit
 from latticebench.systems.effects import Effect
 from latticebench.systems.errors import InputError
@@ -31,31 +29,54 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
+One = TypeVar("One")
+
+# Readings beyond twice the number of unknowns that a diagnosis needs.
+SPARE = 10
+
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What the search found, and the errors before and after it.
+    """What was found, and the errors before and after it.
 
     Attributes:
-        course: how the search went.
-        noise: standard deviation of the noise on u and, where it was observed, v; of each part of a complex field.
-        residual: RMS of what the fits leave of the readings, in units of the noise, before and after.
-        dynamics: RMS of what the equation leaves of the derivative over that of the derivative, before and after.
-        forecasts: of the held-out data, before and after; one per trajectory.
-        criterion: the Bayesian information criterion, before and after, less a common constant.
-        declared: coefficients of the declared terms, before and after, both fitted to the same pieces.
-        used: number of sample times that the search used, and number of those recorded.
+        before, after: the declared equation, and with all that was found.
+        findings: the effects of the last model.
+        verdict: "nothing missing", "explained", "partly explained" or "unexplained".
+        horizons: how the search went.
+        left: what is significant in the last residual without having a name, the best first.
+        data: recordings as they were used.
+        used: sample times that were used, and those recorded.
+        noise: standard deviation of each sensor: u of site 1, ..., N, then v; NaN where nothing was read. It is what
+            the last model leaves; where something is left in that, no more than the readings alone show.
+        noise_lines: the noise of each sensor in words.
+        residual: RMS of what is left over the noise, before and after.
+        rms: the same in units of the readings.
+        dynamics: share of the derivative, along smoothed readings, that the equation leaves, before and after.
+        forecasts: of the held-out data, before and after; one per recording.
+        criterion: the Bayesian information criterion less that of the declared equation, before and after.
+        declared: coefficients of the declared terms, before and after.
+        modes: of the recording, and of the model before and after.
         truth: the true coefficients of the declared terms, or None where they are not known (see `against`).
     """
 
-    course: Course
-    noise: Float[ndarray, " levels"]
+    before: Fitted
+    after: Fitted
+    findings: tuple[Finding, ...]
+    verdict: str
+    horizons: tuple[Horizon, ...]
+    left: tuple[Left, ...]
+    data: tuple[Samples, ...]
+    used: tuple[int, int]
+    noise: Float[ndarray, " sensors"]
+    noise_lines: tuple[str, ...]
     residual: tuple[float, float]
+    rms: tuple[float, float]
     dynamics: tuple[float, float]
     forecasts: tuple[list[Prediction], list[Prediction]]
     criterion: tuple[float, float]
     declared: tuple[Float[ndarray, " terms"], Float[ndarray, " terms"]]
-    used: tuple[int, int] = (0, 0)
+    modes: tuple[tuple[Mode, ...], tuple[Mode, ...], tuple[Mode, ...]]
     truth: Float[ndarray, " terms"] | None = None
 
     def against(self, truth: Float[ndarray, " terms"] | None) -> Diagnosis:
@@ -77,16 +98,22 @@ class Diagnosis:
         return before, after
 
 
+class Interrupted(Exception):
+    """A diagnosis was interrupted; what is known so far is in `diagnosis`."""
+
+    def __init__(self, diagnosis: Diagnosis) -> None:
+        super().__init__("interrupted")
+        self.diagnosis = diagnosis
+
+
 def diagnose(
     declared: Library,
     order: int,
     data: Sequence[Samples],
     catalogue: Sequence[Effect],
-    seed: int = 1,
     *,
     held_out: Sequence[Samples] = (),
-    watcher: Watcher = lambda _: None,
-    start: Float[ndarray, " terms"] | None = None,
+    watcher: Watcher | None = None,
 ) -> Diagnosis:
     """Find what a declared equation lacks of recordings.
 
@@ -95,13 +122,12 @@ def diagnose(
         order: of the time derivative.
         data: recordings; the truth of simulated ones is not used.
         catalogue: effects that may be missing.
-        seed: of the surrogates.
         held_out: recordings to judge forecasts on; the last 30 % of each of `data` when there are none.
         watcher: called with a text that says what is being done.
-        start: coefficients of the declared equation to start from, where another method has fitted them.
 
     Raises:
         InputError: the equation cannot be set up on the data.
+        Interrupted: the user stopped it (KeyboardInterrupt) when something was known already.
     """
     shown = [one.observed() if isinstance(one, SimulatedSamples) else one for one in data]
     check_fit(shown, declared, order)
@@ -110,35 +136,133 @@ def diagnose(
             raise InputError(f"{one.source}: nothing moves; a diagnosis needs a motion")
     # More threads than this are slower on matrices of these sizes.
     with threadpool_limits(1):
-        course = search(
-            Model(declared, order), shown, catalogue, np.random.default_rng(seed), watcher=watcher, start=start
-        )
-        watcher("forecasting")
-        return _with_errors(course, held_out, sum(len(one.t) for one in shown))
+        problem = Problem.of(declared, order, shown, catalogue)
+        _check_enough(problem)
+        search = Search(problem, watcher or (lambda _: None))
+        found = None
+        recorded = sum(len(one.t) for one in shown)
+        try:
+            for step in search.horizons():
+                # A model that loses the readings over longer pieces is judged by those that it can follow.
+                if found is None or not search.lost(step.models[0]) or search.lost(found.models[0]):
+                    found = step
+            if found is None:
+                raise InputError(f"{shown[0].source}: the declared equation cannot be followed even over a few samples")
+            best = _named(search, found, held_out)
+        except KeyboardInterrupt:
+            if found is None:
+                raise
+            plain = Compared(found.models[0], (np.nan,) * len(found.models[0].model.effects), _none_equal(found))
+            raise Interrupted(_diagnosis(problem, found, plain, held_out, recorded)) from None
+        search.say("forecasting")
+        return _diagnosis(problem, found, best, held_out, recorded)
 
 
-def _with_errors(course: Course, held_out: Sequence[Samples], recorded: int) -> Diagnosis:
-    """Return the diagnosis with the errors before and after.
+def _none_equal(found: Found) -> tuple[tuple[str, ...], ...]:
+    return ((),) * len(found.models[0].model.effects)
 
-    Args:
-        course: how the search went.
-        held_out: recordings to judge forecasts on.
-        recorded: number of sample times in the recordings.
+
+def _check_enough(problem: Problem) -> None:
+    """Refuse recordings with fewer readings than a model has unknowns.
+
+    Raises:
+        InputError: there are too few readings.
     """
-    sides = (course.before, alike(course.after, course.before))
-    size = noise_of_fit(course.after)
-    gain = sides[1].gain(sides[0])
-    more = course.after.parameters - course.before.parameters
-    count = len(course.before.model.declared.terms)
-    before, after = (one.solution.state.coefficients[:count] for one in sides)
+    count = sum(int(np.sum(record.seen)) for record in problem.records)
+    unknown = len(problem.declared.terms) + sum(nodes.shape[1] for nodes in problem.nodes)
+    if count < 2 * unknown + SPARE:
+        raise InputError(
+            f"{problem.data[0].source}: {count} readings are too few for {unknown} unknowns "
+            "(the coefficients and each trajectory's start); give longer or more records"
+        )
+
+
+def _named(search: Search, found: Found, held_out: Sequence[Samples]) -> Compared:
+    """Return the best model after exchanges, without effects that make the forecast worse."""
+    search.say("trying what could stand in the place of each effect")
+    best = compared(search, found.models[0])
+    before, now = (pooled(predict(one, search.problem, held_out)) for one in (found.before, best.fitted))
+    while best.fitted.model.effects and now > (1 + rules.WORSE) * before:
+        search.say("the forecast is worse than before: trying without the weakest effect")
+        weakest = int(np.argmin(best.evidence))
+        fitted = search.without(best.fitted, weakest)
+        error = np.inf if fitted is None else pooled(predict(fitted, search.problem, held_out))
+        if fitted is None or not error < now:
+            break
+        kept = [k for k in range(len(best.evidence)) if k != weakest]
+        evidence = tuple(best.evidence[k] for k in kept)
+        best, now = Compared(fitted, evidence, tuple(best.alternatives[k] for k in kept)), error
+    return best
+
+
+def _diagnosis(problem: Problem, found: Found, best: Compared, held_out: Sequence[Samples], recorded: int) -> Diagnosis:
+    """Return the diagnosis with the errors before and after."""
+    before, after = found.before, best.fitted
+    if not after.model.effects:
+        before = after
+    left = left_in(after, problem)
+    named = findings(best)
+    noise = _noise(problem, after) if left else after.rms
+    more = len(after.model.numbers) - len(before.model.numbers)
+    count = len(before.model.coefficients)
+    comparable = before.longest == after.longest
+    gain = 2 * (before.cost - after.cost) if comparable else float("nan")
+
+    def both(function: Callable[[Fitted], One]) -> tuple[One, One]:
+        return function(before), function(after)
+
     return Diagnosis(
-        course,
-        size,
-        residual=(residual_rms(course.before, size), residual_rms(course.after, size)),
-        dynamics=(dynamics_share(course.before), dynamics_share(course.after)),
-        # As far ahead as the last model can go, however soon the declared one loses the readings.
-        forecasts=(predict(alike(course.before, course.after), held_out), predict(course.after, held_out)),
-        criterion=(0.0, more * float(np.log(course.after.count)) - gain),
-        declared=(before, after),
-        used=(sum(len(one.t) for one in course.after.data), recorded),
-    )
+        before, after, named, _verdict(named, left), found.horizons, left, problem.data,
+        (sum(len(one.t) for one in problem.data), recorded), noise, _noise_lines(problem, after),
+        residual=both(lambda one: _over(one, noise)),
+        rms=both(lambda one: float(np.sqrt(np.nanmean(one.followed.left**2)))),
+        dynamics=both(lambda one: _dynamics(problem, one)),
+        forecasts=both(lambda one: predict(one, problem, held_out)),
+        criterion=(0.0, more * float(np.log(after.layout.readings())) - gain),
+        declared=both(lambda one: np.array(one.model.coefficients[:count])),
+        modes=(modes.of_recording(problem), modes.of_model(before), modes.of_model(after)),
+    )  # fmt: skip
+
+
+def _verdict(named: Sequence[Finding], left: Sequence[Left]) -> str:
+    if named:
+        return "partly explained" if left else "explained"
+    return "unexplained" if left else "nothing missing"
+
+
+def _noise(problem: Problem, after: Fitted) -> Float[ndarray, " sensors"]:
+    """Return the noise of each sensor where something is left: by the last model or, if less, by the readings alone."""
+    own, readings = after.rms, problem.noise
+    return np.where(np.isfinite(readings) & (readings > 0), np.fmin(own, readings), own)
+
+
+def _over(fitted: Fitted, noise: ndarray) -> float:
+    """Return the RMS of what a fit leaves, in units of the noise."""
+    ratio = fitted.followed.left / noise[fitted.rows.sensor]
+    return float(np.sqrt(np.nanmean(ratio**2)))
+
+
+def _noise_lines(problem: Problem, after: Fitted) -> tuple[str, ...]:
+    return tuple(describe(after.noise, problem.steps, interval=problem.step))
+
+
+def _dynamics(problem: Problem, fitted: Fitted) -> float:
+    """Return the share of the derivative that a model leaves along the smoothed motion, its instruments undone."""
+    motion, right = [], []
+    for number, (record, nodes, splines) in enumerate(
+        zip(problem.records, problem.nodes, problem.splines, strict=True)
+    ):
+        assembled = fitted.model.assembled(problem.plain, problem.chain, number)
+        dynamics, t = assembled.dynamics, record.times
+        states = unread(fitted.model, fitted.layout, number, nodes)
+        f = None if record.stretches.inputs is None else record.stretches.inputs(t)
+        driven = record.stretches.driven(t, splines)
+        with np.errstate(all="ignore"):
+            rate = dynamics.linear(assembled.coefficients, t, states, f, driven, derivatives=False)[0]
+        shape = (len(t), dynamics.order, dynamics.parts, dynamics.count)
+        right.append(rate.reshape(shape)[:, -1])
+        seen = np.where(record.seen, record.value, np.nan)[..., problem.plain.moving]
+        raw = np.concatenate([seen, nodes.reshape(shape)[:, seen.shape[1] :]], axis=1).reshape(nodes.shape)
+        read = unread(fitted.model, fitted.layout, number, raw).reshape(shape)
+        motion.append(read[:, problem.chain.levels - 1])
+    return derivative_share(problem, motion, right)

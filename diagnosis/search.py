@@ -1,264 +1,415 @@
-"""The search: trace what is left to an effect, add that, and again, until nothing is left or nothing explains it."""
+"""The search: from short pieces, where a wrong equation can follow, too, to whole recordings.
+
+At each horizon the best models are opened: every candidate is ranked by its score, the best few are fitted with all
+that was accepted before, and effects that have become doubtful are tried without. The best models go on to the next
+horizon.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.contest import (
-    BETTER,
-    EQUAL,
-    TIMED,
-    Contender,
-    Means,
-    Watcher,
-    chosen,
-    contest,
-    rival_of,
-    trusted,
-    unfitted,
-)
-from latticebench.diagnosis.horizon import Horizon, thinned
-from latticebench.diagnosis.model import Fitted, Model
-from latticebench.diagnosis.offsets import lead_of_forces, settled
-from latticebench.diagnosis.reconsider import COMPARABLE, Equal, pruned, reconsidered
-from latticebench.diagnosis.residual import alike, residual_rms
-from latticebench.diagnosis.significance import FALSE_ALARM, anything_at_all, beyond_chance, is_exact
-from latticebench.diagnosis.trace import Screened
-from latticebench.systems.effects import Effect
-from latticebench.systems.errors import InputError
-from latticebench.systems.samples import Samples
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.acting import Placed
+from latticebench.diagnosis.fitting import Fitted, fit
+from latticebench.diagnosis.horizon import Layout, unread
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.noise import Structure
+from latticebench.diagnosis.problem import Problem, regressed, turned
+from latticebench.diagnosis.score import Scored, Tangent
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy import ndarray
+Watcher = Callable[[str], None]
 
-MOST_EFFECTS = 4
-# Where the model with the added effects still loses the readings and leaves more than this share of what the declared
-# equation left beyond the noise, nothing counts as found.
-HARDLY = 0.5
-# Readings beyond twice the number of unknowns that a test of what is left needs.
-SPARE = 10
+# On short horizons so many rows are looked at, or so many pieces' worth if that is more.
+ROWS, PIECES = 1200, 4
+# A size of u that does not matter: a share of the readings at first, then of the noise.
+SMALL_SHARE, SMALL_NOISE = 1e-3, 0.1
+# Gauss-Newton steps of a first fit, of one at the next horizon, and of one with an effect more or less.
+FIRST, CARRIED, CHANGED = 40, 25, 10
+# Models whose costs and readings differ by less (nats; share of the noise) are one model said in two ways.
+SAME_COST, SAME_READING = 0.3, 0.05
+# An effect is tried without where its own uncertainty leaves less than so many nats beyond its price.
+DOUBT = 8.0
+# Pieces grow twofold up to so many of the shortest periods, and faster beyond.
+SLOWLY, TWICE, THRICE = 8, 2, 3
+
+# A candidate may take the place of an effect if it can do this share of what the effect does.
+MOST_OF_IT = 0.9
+# Sensors are tried from the other side on chains of so many sites at most.
+MOST_TURNED = 3
+
+# A misfit grows with the signal, too: noise is taken to do so only where no more than so many times the noise is left.
+NEAR = 2.0
+# On so few sensors each has a size and a correlation of its own whether or not that is plain.
+FEW_SENSORS = 8
+
+COUPLING = "u[n+1]+u[n-1]-2*u[n]"
+
+Pool = dict[tuple[str, ...], Fitted]
 
 
-@dataclass(frozen=True, eq=False)
-class Round:
-    """One round of the search.
+@dataclass(frozen=True)
+class Tried:
+    """A candidate of the best model of a horizon: its score, and the nats that it had to bring."""
+
+    name: str
+    gain: float
+    price: float
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """A horizon that the search has been through.
 
     Attributes:
-        ranking: all effects and unnamed terms, the best first.
-        added: the effect that was added, or None.
-        equal: names of the effects that explain the residual as well.
+        samples: rows of the longest piece.
+        periods: its length in periods of the main frequency.
+        models: effects of the models that went on, and how many nats each was behind the best.
+        tried: candidates of the best model, the best first.
     """
 
-    ranking: tuple[Contender, ...]
-    added: str | None = None
-    equal: tuple[str, ...] = ()
+    samples: int
+    periods: float
+    models: tuple[tuple[tuple[str, ...], float], ...]
+    tried: tuple[Tried, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """How the search went.
+class Found:
+    """How far a search has come.
 
     Attributes:
-        before: the declared equation's fit.
-        after: the fit with every effect that was added.
-        equal: for each effect of the last model, the effects that cannot be told from it.
-        rounds: of the search.
-        left: what is significant in the last residual, the best first.
-        verdict: "nothing missing", "explained", "partly explained" or "unexplained".
-        rival: the unnamed term that does as well as the last effect in its place, or better, and its lead in natural
-            logarithms of the likelihood ratio; or None.
+        before: the declared equation on the longest horizon on which it could be followed.
+        models: the best models on the last horizon, the best first.
+        horizons: those that were gone through.
     """
 
     before: Fitted
-    after: Fitted
-    equal: Equal
-    rounds: tuple[Round, ...]
-    left: tuple[Screened, ...]
-    verdict: str
-    rival: tuple[str, float] | None = None
+    models: tuple[Fitted, ...]
+    horizons: tuple[Horizon, ...]
 
-    @property
-    def repeated(self) -> tuple[str, ...]:
-        """Effects with a frequency or time of their own that were added more than once.
 
-        Together they can stand for any course in time.
+class Search:
+    """A search for what an equation lacks."""
+
+    def __init__(self, problem: Problem, watcher: Watcher) -> None:
+        self.problem, self.say = problem, watcher
+        self.structure = Structure()
+        self.small = SMALL_SHARE * problem.height
+        self.tried: dict[tuple[str, ...], tuple[Tried, ...]] = {}
+        self.open: tuple[Placed, ...] = problem.candidates
+
+    def value(self, fitted: Fitted) -> float:
+        """Return the cost of a fit with the prices of its effects and of the noise's parameters, in nats."""
+        model = fitted.model
+        price = sum(self.problem.price_of(one) for one in model.effects)
+        noise = fitted.noise.parameters / 2 * np.log(max(fitted.layout.readings(), 2))
+        return fitted.cost + price + float(noise) + self._repelling(model)
+
+    def _repelling(self, model: Model) -> float:
+        """Return what a chain costs whose neighbours push each other away: a sensor that looks from the other side."""
+        if self.problem.chain.is_complex or model.order != 2 or self.problem.chain.sites == 1:
+            return 0.0
+        pairs = zip(model.declared.texts, model.coefficients, strict=True)
+        return rules.REPELLING if any(text == COUPLING and value < 0 for text, value in pairs) else 0.0
+
+    def horizons(self) -> Iterator[Found]:
+        """Yield what was found on each horizon, from short pieces to whole recordings."""
+        done: tuple[Horizon, ...] = ()
+        last: Found | None = None
+        for length in self._lengths():
+            whole = length >= max(len(one.t) for one in self.problem.data)
+            waves = length * self.problem.step * self.problem.main / (2 * np.pi)
+            late = whole or waves >= rules.PERIODS or (last is not None and self.lost(last.models[0]))
+            self.open = tuple(one for one in self.problem.candidates if late or not one.timed)
+            carried = self._first(length) if last is None else self._carried(last, length)
+            if not carried:
+                break
+            before, fits = carried[0], list(carried[1:])
+            self.say(f"following pieces of {waves:.3g} periods")
+            best = self._level(fits)
+            base = self.value(best[0])
+            models = tuple((_names(one.model), self.value(one) - base) for one in best)
+            done = (*done, Horizon(best[0].longest, waves, models, self.tried.get(best[0].model.key, ())))
+            last = Found(before, tuple(best), done)
+            yield last
+
+    def lost(self, fitted: Fitted) -> bool:
+        """Return whether a model leaves much more of the readings than their own noise."""
+        noise = self.problem.noise
+        return bool(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0) > rules.LOST)
+
+    def _lengths(self) -> list[int]:
+        """Return the lengths of pieces, in rows."""
+        problem, found = self.problem, []
+        longest = max(len(one.t) for one in problem.data)
+        shortest = 2 * np.pi / problem.top / problem.step
+        least = 2 * problem.chain.order // problem.chain.levels + 2
+        length = max(int(rules.FIRST_HORIZON * shortest), least)
+        while length < 0.6 * longest:
+            found.append(length)
+            length *= TWICE if length < SLOWLY * shortest else THRICE
+        return [*found, longest]
+
+    def layout(self, length: int) -> Layout:
+        """Return pieces of a length: of all rows on long horizons, of some on short ones."""
+        longest = max(len(one.t) for one in self.problem.data)
+        most = None if length >= longest else max(ROWS, PIECES * length)
+        return Layout.of(self.problem, length, most, self.small)
+
+    def _first(self, length: int) -> list[Fitted]:
+        """Return the declared equation, and the rivals that begin the search."""
+        problem = self.problem
+        layout = self.layout(length)
+        start = Model(problem.declared, problem.order, regressed(problem))
+        still = replace(start, coefficients=(0.0,) * len(start.coefficients))
+        fits: list[Fitted] = []
+        at_once = [(start.with_effect(one), problem) for one in problem.candidates if one.from_the_start]
+        for model, seen in ((start, problem), (still, problem), *at_once, *self._mirrored(start)):
+            if model is still and fits:
+                continue
+            near = [nodes[rows] for nodes, rows in zip(seen.nodes, layout.rows, strict=True)]
+            ready = layout.with_substeps(model, near, problem.top)
+            found = self.refit(model, ready, near, None, FIRST)
+            fits += [found] if found is not None else []
+        if not fits:
+            return []
+        self.small = max(SMALL_NOISE * float(np.nanmin(fits[0].rms)), 1e-3 * SMALL_SHARE * problem.height)
+        self._choose_structure(fits[0])
+        return [fits[0], *fits]
+
+    def _mirrored(self, start: Model) -> list[tuple[Model, Problem]]:
+        """Return the declared equation with one sensor that looks from the other side, and the states it then has."""
+        found = []
+        for one in self._sensors() if self._repelling(start) else ():
+            other = one.turned()
+            if other is not None and one.site is not None:
+                seen = turned(self.problem, one.site)
+                model = replace(start, coefficients=regressed(seen))
+                if not self._repelling(model):
+                    found.append((model.with_effect(other), seen))
+        return found
+
+    def _sensors(self) -> list[Placed]:
+        """Return what can be said of single sensors' sign, all but the first one's."""
+        if self.problem.chain.sites > MOST_TURNED:
+            return []
+        return [one for one in self.problem.candidates if one.turned() is not None and one.site != 0]
+
+    def _other_side(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
+        """Yield the mirror image of a chain of two whose sites push each other away: its second sensor is turned.
+
+        With w = -u of the second site, C (w - u) + k u is -C (u2 - u) + (k + 2 C) u of the first, and the like.
         """
-        return _repeated(self.after)
+        texts = list(fitted.model.declared.texts)
+        if self.problem.chain.sites != 2 or not self._repelling(fitted.model) or "u[n]" not in texts:
+            return
+        coefficients = list(fitted.model.coefficients)
+        pull, own = texts.index(COUPLING), texts.index("u[n]")
+        coefficients[own] -= 2 * coefficients[pull]
+        coefficients[pull] *= -1
+        plain = replace(fitted.model, coefficients=tuple(coefficients))
+        for one in self._sensors():
+            there = [k for k, placed in enumerate(plain.effects) if placed.place == one.place]
+            model = plain.without(there[0]) if there else plain
+            other = (plain.effects[there[0]] if there else one).turned()
+            if other is not None and model.with_effect(other).key not in pool:
+                sign = np.tile([1.0, -1.0], self.problem.chain.order)
+                near = [nodes * sign for nodes in fitted.followed.nodes]
+                found = self.refit(model.with_effect(other), fitted.layout, near, fitted, CHANGED)
+                if found is not None:
+                    yield found
 
+    def _choose_structure(self, fitted: Fitted) -> None:
+        """Let the readings choose the parts of the noise model that all models of a horizon share."""
+        from latticebench.diagnosis.noise import estimate
 
-@dataclass(frozen=True, eq=False)
-class _Progress:
-    """Where the search is.
-
-    Attributes:
-        fitted: the model so far.
-        equal, rounds, left, rival: as in `Course`.
-        doubted: set while an unnamed term did better than the last effect that was added.
-    """
-
-    fitted: Fitted
-    equal: Equal = ()
-    rounds: tuple[Round, ...] = ()
-    left: tuple[Screened, ...] = ()
-    rival: tuple[str, float] | None = None
-    doubted: _Doubted | None = None
-
-    def with_round(self, ranking: Sequence[Contender]) -> _Progress:
-        """Return the same after a round that added nothing."""
-        return replace(self, rounds=(*self.rounds, Round(tuple(ranking))))
-
-    def back_to(self, fitted: Fitted, equal: Equal, number: int) -> _Progress:
-        """Return the same as if the round of this number had been the last one and had added nothing."""
-        last = replace(self.rounds[number], added=None, equal=())
-        left = beyond_chance([one.screened for one in last.ranking])
-        return replace(self, fitted=fitted, equal=equal, rounds=(*self.rounds[:number], last), left=left)
-
-
-@dataclass(frozen=True, eq=False)
-class _Doubted:
-    """Where the search was when an unnamed term did better than the best effect, and the evidence of both."""
-
-    fitted: Fitted
-    equal: Equal
-    round: int
-    named: float
-    unnamed: float
-
-
-def search(
-    model: Model,
-    data: Sequence[Samples],
-    catalogue: Sequence[Effect],
-    draw: np.random.Generator,
-    *,
-    watcher: Watcher = lambda _: None,
-    most: int = MOST_EFFECTS,
-    surrogates: int = 200,
-    start: Float[ndarray, " terms"] | None = None,
-) -> Course:
-    """Search for the effects that an equation lacks.
-
-    A long record that is sampled far more densely than it moves is thinned first, and of a very long one only parts are
-    used.
-
-    Args:
-        model: the declared equation.
-        data: recordings.
-        catalogue: effects that may be missing.
-        draw: for the surrogates.
-        watcher: called with a text that says what is being done.
-        most: effects that are added at most.
-        surrogates: number of simulated recordings that the null distribution comes from.
-        start: coefficients of the declared equation to start from, where another method has fitted them.
-
-    Raises:
-        InputError: the readings are too few for the unknowns.
-    """
-    watcher("fitting the declared equation")
-    horizon = Horizon.of([thinned(samples, model.order) for samples in data], model)
-    before = horizon.first(model, start)
-    if before.count < 2 * before.parameters + SPARE:
-        raise InputError(
-            f"{data[0].source}: {before.count:.0f} readings are too few for {before.parameters:.0f} unknowns "
-            "(the coefficients and each trajectory's start); give longer or more records"
+        followed = fitted.followed
+        found = estimate(followed.left, followed.level, fitted.rows).structure
+        few = len(fitted.rms) <= FEW_SENSORS
+        noise = self.problem.noise
+        near = bool(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0) < NEAR)
+        self.structure = replace(
+            found, growth=found.growth and near, own_sizes=found.own_sizes or few, memory=found.memory or few
         )
-    means = Means(horizon, catalogue, draw, surrogates, watcher)
-    now, ended, lost = _Progress(before), False, not horizon.follows(before)
-    while not ended:
-        now, ended = _next_round(now, means, lost=lost, most=most)
-    if now.doubted is not None:
-        # An unnamed term explains more than every effect, alone or with another: none of them is right.
-        now = now.back_to(now.doubted.fitted, now.doubted.equal, now.doubted.round)
-    return _concluded(before, _tested_again(before, now, means), horizon)
+
+    def _carried(self, last: Found, length: int) -> list[Fitted]:
+        """Return the declared equation and the best models on a longer horizon."""
+        self.small = max(SMALL_NOISE * float(np.nanmin(last.models[0].rms)), 1e-3 * SMALL_SHARE * self.problem.height)
+        self._choose_structure(last.models[0])
+        layout = self.layout(length)
+        fits = [found for one in last.models if (found := self.carry(one, layout)) is not None]
+        if not fits:
+            return []
+        plain = next((one for one in fits if not one.model.effects), None) or self.carry(last.before, layout)
+        return [plain or last.before, *fits]
+
+    def carry(self, fitted: Fitted, layout: Layout, steps: int = CARRIED) -> Fitted | None:
+        """Return a model on another layout, from where it ended."""
+        near = []
+        for number, rows in enumerate(layout.rows):
+            nodes = np.array(unread(fitted.model, layout, number, self.problem.nodes[number]))
+            old, valid = fitted.layout.rows[number], fitted.layout.valid[number]
+            nodes[old[valid]] = fitted.followed.nodes[number][valid]
+            near.append(nodes[rows])
+        ready = layout.with_substeps(fitted.model, near, self.problem.top)
+        return self.refit(fitted.model, ready, near, fitted, steps)
+
+    def refit(
+        self,
+        model: Model,
+        layout: Layout,
+        near: list[np.ndarray] | tuple[np.ndarray, ...],
+        start: Fitted | None,
+        steps: int,
+    ) -> Fitted | None:
+        """Return the fit of a model; None where it cannot be followed."""
+        noise = None if start is None else start.noise
+        with np.errstate(all="ignore"):
+            try:
+                return fit(model, layout, near, structure=self.structure, noise=noise, steps=steps)
+            except np.linalg.LinAlgError:
+                return None
+
+    # One horizon ------------------------------------------------------------------------------------------------------
+
+    def _level(self, fits: list[Fitted]) -> list[Fitted]:
+        """Return the best models of a horizon."""
+        pool: Pool = {}
+        for one in fits:
+            self._keep(pool, one)
+        opened: set[tuple[str, ...]] = set()
+        while todo := [one for one in self._leading(pool) if one.model.key not in opened]:
+            opened.add(todo[0].model.key)
+            leader = todo[0] is self._leading(pool)[0]
+            for found in self._neighbours(todo[0], pool, timed=leader, first=len(opened) == 1):
+                self._keep(pool, found)
+        return self._leading(pool)
+
+    def _keep(self, pool: Pool, one: Fitted) -> None:
+        key = one.model.key
+        if key not in pool or self.value(one) < self.value(pool[key]):
+            pool[key] = one
+
+    def _leading(self, pool: Pool) -> list[Fitted]:
+        """Return the best models that differ in what they say of the readings."""
+        ranked = sorted(pool.values(), key=self.value)
+        found: list[Fitted] = []
+        for one in ranked:
+            if self.value(one) > self.value(ranked[0]) + rules.BEHIND or len(found) == rules.RIVALS:
+                break
+            if not any(same(one, other) for other in found):
+                found.append(one)
+        return found
+
+    def _neighbours(self, fitted: Fitted, pool: Pool, *, timed: bool, first: bool) -> Iterator[Fitted]:
+        """Yield models with a doubtful effect less, and with one of the best candidates more."""
+        here = self.value(fitted)
+        model = fitted.model
+        for number in range(len(model.effects)):
+            if model.without(number).key not in pool and not self._sure(fitted, number):
+                found = self.without(fitted, number)
+                if found is not None:
+                    yield found
+        yield from self._plainer(fitted, pool)
+        yield from self._other_side(fitted, pool)
+        if len(model.effects) < rules.MOST_EFFECTS:
+            for one in self._tried(fitted, timed=timed, discrete=first):
+                if model.with_effect(one.placed).key not in pool:
+                    found = self.with_effect(fitted, one.placed)
+                    if found is not None and self.value(found) < here:
+                        yield found
+
+    def _plainer(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
+        """Yield models with a likelier effect in the place of one that stands in for many."""
+        for number, placed in enumerate(fitted.model.effects):
+            if placed.effect.name in rules.STAND_INS:
+                plain = [
+                    one for one in self.standing_in(fitted, number) if one.placed.effect.name not in rules.STAND_INS
+                ]
+                for one in plain[:2]:
+                    model = fitted.model.without(number).with_effect(one.placed)
+                    if model.key not in pool:
+                        found = self.refit(model, fitted.layout, fitted.followed.nodes, fitted, CHANGED)
+                        if found is not None:
+                            yield found
+
+    def _tried(self, fitted: Fitted, *, timed: bool, discrete: bool) -> list[Scored]:
+        """Return the candidates that are fitted in full."""
+        found = self.screened(fitted, timed=timed)
+        best = [one for one in found if one.placed.linear][: rules.TRIED]
+        return best + [one for one in found if discrete and not one.placed.linear]
+
+    def _sure(self, fitted: Fitted, number: int) -> bool:
+        """Return whether an effect is beyond doubt by its numbers and their covariance."""
+        placed, block = fitted.model.effects[number], fitted.model.blocks[number]
+        strength = np.array(placed.strength)
+        if not len(strength):
+            return False
+        kept = slice(block.start, block.start + len(strength))
+        wald = float(strength @ np.linalg.pinv(fitted.covariance[kept, kept]) @ strength) / 2
+        return wald > self.problem.price_of(placed) + DOUBT
+
+    def without(self, fitted: Fitted, number: int) -> Fitted | None:
+        """Return the fit without one effect."""
+        return self.refit(fitted.model.without(number), fitted.layout, fitted.followed.nodes, fitted, CHANGED)
+
+    def with_effect(self, fitted: Fitted, placed: Placed) -> Fitted | None:
+        """Return the fit with one effect more, from its score's numbers or, where these lead astray, from a tenth."""
+        numbers = placed.numbers
+        weaker = numbers.copy()
+        weaker[: len(placed.strength)] *= 0.1
+        for start in (numbers, weaker) if len(placed.strength) else (numbers,):
+            model = fitted.model.with_effect(placed.moved(start))
+            found = self.refit(model, fitted.layout, fitted.followed.nodes, fitted, CHANGED)
+            if found is not None:
+                return found
+        return None
+
+    def standing_in(self, fitted: Fitted, number: int) -> list[Scored]:
+        """Return candidates that could do most of what one effect does, one of each name, the best first."""
+        placed = fitted.model.effects[number]
+        if not placed.linear or placed.timed:
+            return []
+        present = {one.place for one in fitted.model.effects}
+        absent = [one for one in self.open if one.place not in present and not one.timed]
+        ranked = sorted(Tangent(fitted).standing_in(number, absent), key=lambda one: -one.gain)
+        best: dict[tuple[object, ...], Scored] = {}
+        for one in ranked:
+            if one.gain > MOST_OF_IT:
+                best.setdefault((one.placed.effect.name, len(one.placed.strength)), one)
+        return list(best.values())
+
+    def screened(self, fitted: Fitted, *, timed: bool = True) -> list[Scored]:
+        """Return the candidates whose score is above their price, the best first; those without a score come last."""
+        present = {one.place for one in fitted.model.effects if not one.timed}
+        absent = [one for one in self.open if one.place not in present and (timed or not one.timed)]
+        best: dict[tuple[object, ...], tuple[float, Scored]] = {}
+        tried: dict[str, Tried] = {}
+        for one in Tangent(fitted).scored(absent):
+            name = one.placed.effect.name
+            price = self.problem.price(name, one.freedom) + self.problem.locked(one.placed)
+            if name not in tried or one.gain - price > tried[name].gain - tried[name].price:
+                tried[name] = Tried(name, one.gain, price)
+            key = one.placed.place
+            if one.freedom and one.gain > price and (key not in best or one.gain - price > best[key][0]):
+                best[key] = (one.gain - price, one)
+        self.tried[fitted.model.key] = tuple(sorted(tried.values(), key=lambda one: one.price - one.gain))
+        ranked = [one for _, one in sorted(best.values(), key=lambda pair: -pair[0])]
+        return ranked + [Scored(one, 0.0, 1, 0.0) for one in absent if not one.linear]
 
 
-def _next_round(now: _Progress, means: Means, *, lost: bool, most: int) -> tuple[_Progress, bool]:
-    """Return the search after one more round, and whether that was the last one.
-
-    Args:
-        now: where the search is.
-        means: what it works with.
-        lost: whether the declared equation loses the readings.
-        most: effects that are added at most.
-    """
-    fitted, horizon = now.fitted, means.horizon
-    means.watcher(f"tracing what is left, round {len(now.rounds) + 1}")
-    screened = means.screen(fitted)
-    now = replace(now, left=() if is_exact(fitted) else beyond_chance(screened))
-    if not now.left or len(fitted.model.effects) >= most:
-        left = now.left or anything_at_all(fitted, means.draw, means.surrogates)
-        return replace(now.with_round(unfitted(screened)), left=left), True
-    ranking = contest(fitted, screened, means.watcher, lost=not horizon.follows(fitted))
-    best, margin = chosen(trusted(ranking, horizon) if lost else ranking)
-    count = sum(one.named for one in screened)
-    if best is None or best.fitted is None or best.p * count > FALSE_ALARM:
-        return now.with_round(ranking), True
-    # The second of two effects: together they must do clearly more than the unnamed term did alone.
-    if now.doubted is not None and best.evidence + now.doubted.named < now.doubted.unnamed + EQUAL:
-        return now.with_round(ranking), True
-    return _with_best(now, ranking, best, margin, means), False
+def same(one: Fitted, other: Fitted) -> bool:
+    """Return whether two fits say the same of the readings."""
+    levels = one.followed.level, other.followed.level
+    if abs(one.cost - other.cost) > SAME_COST or levels[0].shape != levels[1].shape:
+        return False
+    size = other.noise.deviation()[other.rows.sensor]
+    return float(np.sqrt(np.nanmean(((levels[0] - levels[1]) / size) ** 2))) < SAME_READING
 
 
-def _with_best(now: _Progress, ranking: Sequence[Contender], best: Contender, margin: float, means: Means) -> _Progress:
-    """Return the search with the best effect of a ranking added."""
-    assert best.fitted is not None
-    horizon, fitted = means.horizon, now.fitted
-    found = rival_of(ranking, best)
-    doubted = None
-    if now.doubted is None and found[1] > (BETTER if horizon.sees_all(fitted) else best.evidence):
-        doubted = _Doubted(fitted, now.equal, len(now.rounds), best.evidence, best.evidence + found[1])
-    least = max(best.evidence - margin, COMPARABLE * best.evidence)
-    near = tuple(
-        one.name
-        for one in ranking
-        if one is not best and one.screened.named and one.fitted is not None and one.evidence > least
-    )
-    # An effect that an unnamed term explains as well is no explanation yet.
-    rival = found if found[1] > 0 and horizon.sees_all(fitted) else None
-    larger, equal = pruned(best.fitted, (*now.equal, near))
-    means.watcher("looking farther")
-    larger = settled(horizon.lengthen(larger))
-    return _Progress(larger, equal, (*now.rounds, Round(tuple(ranking), best.name, near)), now.left, rival, doubted)
-
-
-def _tested_again(before: Fitted, now: _Progress, means: Means) -> _Progress:
-    """Return the search with its effects tested again, now that all of them are in the model."""
-    fitted, equal = pruned(now.fitted, now.equal, all_of_them=True)
-    now = replace(now, fitted=fitted, equal=equal)
-    if len(fitted.model.effects) > 1:
-        fitted, equal, left = reconsidered(fitted, equal, now.left, means)
-        now = replace(now, fitted=fitted, equal=equal, left=left)
-    if fitted.model.effects and not means.horizon.follows(fitted) and _hardly(before, fitted, means.horizon):
-        now = now.back_to(before, (), 0)
-    return now
-
-
-def _concluded(before: Fitted, now: _Progress, horizon: Horizon) -> Course:
-    """Return the course with its verdict."""
-    fitted, rival = now.fitted, now.rival
-    if not fitted.model.effects:
-        rival = None
-    elif rival is None and horizon.follows(fitted):
-        rival = lead_of_forces(fitted)
-    if fitted.model.effects:
-        verdict = "partly explained" if now.left or rival or _repeated(fitted) else "explained"
-    else:
-        verdict = "unexplained" if now.left else "nothing missing"
-    return Course(before, fitted, now.equal, now.rounds, now.left, verdict, rival)
-
-
-def _hardly(before: Fitted, after: Fitted, horizon: Horizon) -> bool:
-    """Return whether the added effects take away only a small part of what is beyond the noise."""
-    shares = [residual_rms(one, horizon.noise) ** 2 - 1 for one in (alike(before, after), after)]
-    return shares[1] > HARDLY * shares[0]
-
-
-def _repeated(fitted: Fitted) -> tuple[str, ...]:
-    timed = Counter(placed.effect.name for placed in fitted.model.effects if placed.effect.acts in TIMED)
-    return tuple(name for name, count in timed.items() if count > 1)
+def _names(model: Model) -> tuple[str, ...]:
+    return tuple(one.effect.name for one in model.effects)

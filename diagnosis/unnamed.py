@@ -1,35 +1,21 @@
-"""Unnamed terms of the motion, which compete with the catalogue's effects (for readings see `diagnosis.misreadings`).
-
-- Single terms that physicists use and the catalogue lacks; they can be fitted in full.
-- One bond, between neighbours or any two sites, that is another than declared.
-- Smooth functions of one variable, whatever their form (`diagnosis.smooth`): a force that depends on the field, on how
-  far it is from its mean, on the velocity, on a spring's stretch or how fast it is stretched; a declared term that
-  changes in time, along the chain, or in both. They are random effects of unknown variance (`diagnosis.trace`).
-- A declared term that is another at one site or at each, from some moment on, that comes late, or that acts on the
-  neighbours (`diagnosis.modulated`).
-- A force or a declared term of any course in time (`diagnosis.courses`): a force at one site, of its own at each, or
-  alike at all; a force at one site and a declared term that swing at one frequency; a force that travels as a wave.
-- Smooth forces in space and time, which catch whatever else there is.
-"""
+"""What has no name in the catalogue but may be seen in a residual: terms, and forces at single sites."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from latticebench.diagnosis.candidate import MOST_NUMBERS, UNNAMED, Group, as_candidate, group, places, too_wide
-from latticebench.diagnosis.courses import forces_of_any_course, smooth_patterns, travelling_waves, unsteady_terms
-from latticebench.diagnosis.modulated import at_single_sites, coming_late, from_a_moment_on, on_neighbours, turned
-from latticebench.diagnosis.placed import Force, PlacedEffect
-from latticebench.diagnosis.smooth import functions_of_one_variable
-from latticebench.diagnosis.tangent import Path, Tangent, force_along
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.acting import Chain, Force, Placed, Scene
+from latticebench.diagnosis.acting.everywhere import Everywhere
+from latticebench.diagnosis.acting.harmonic import wave
+from latticebench.diagnosis.fitting import Fitted
+from latticebench.diagnosis.problem import Problem
+from latticebench.diagnosis.score import Tangent
 from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
-
-if TYPE_CHECKING:
-    from numpy import ndarray
 
 REAL_TERMS = (
     "u[n]**4", "u[n]**6", "u[n]**7", "sin(u[n])", "sin(2*u[n])", "cos(u[n])", "cos(2*u[n])",
@@ -47,103 +33,86 @@ COMPLEX_TERMS = (
     "abs(u[n+1])**2*u[n+1]+abs(u[n-1])**2*u[n-1]", "u[n]**2*conj(u[n+1]+u[n-1])", "t*u[n]", "n*(u[n+1]+u[n-1]-2*u[n])",
     "t*(u[n+1]+u[n-1]-2*u[n])", "u[n]/(1+abs(u[n])**2)", "u[n+3]+u[n-3]-2*u[n]", "t*abs(u[n])**2*u[n]",
 )  # fmt: skip
+# Frequencies of forces at single sites, at most.
+MOST_FREQUENCIES = 200
 
 
-def unnamed(tangent: Tangent) -> list[Group]:
-    """Return all of them by what they are called in a ranking."""
-    kinds = (
-        _terms,
-        _bonds,
-        _wires,
-        functions_of_one_variable,
-        at_single_sites,
-        from_a_moment_on,
-        coming_late,
-        on_neighbours,
-        forces_of_any_course,
-        unsteady_terms,
-        travelling_waves,
-        smooth_patterns,
-    )
-    return [found for kind in kinds for found in kind(tangent)]
+@dataclass(frozen=True)
+class Left:
+    """Something that is significant in a residual and has no name.
+
+    Attributes:
+        name: in words, or a term.
+        gain: nats that it would win.
+        price: nats that noise alone reaches in its share of `rules.FALSE_DOUBT`.
+        site: where it acts, from 0; None for everywhere.
+    """
+
+    name: str
+    gain: float
+    price: float
+    site: int | None
 
 
-def _parts(path: Path) -> tuple[str, ...]:
-    """Return the factors of a term: a complex field's coefficients are complex."""
-    return ("", "i*") if path.is_complex else ("",)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocalForce(Placed):
+    """A force at one site that swings at one frequency."""
+
+    here: int
+    omega: float
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return every site and frequency."""
+        stride = len(scene.frequencies) // MOST_FREQUENCIES + 1
+        for here in scene.chain.moving:
+            for omega in scene.frequencies[::stride]:
+                yield cls(effect=effect, here=here, omega=float(omega), strength=(0.0,) * (2 * scene.chain.parts))
+
+    @property
+    def site(self) -> int:
+        """The site, from 0."""
+        return self.here
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:
+        """Return cosine and sine."""
+        return ("cos", "sin", "i*cos", "i*sin")[: 2 * chain.parts]
+
+    def forces(self, chain: Chain) -> list[Force]:
+        """Return the waves."""
+        here = np.eye(chain.sites)[self.here]
+        waves = [(text, function) for text in ("1", "i")[: chain.parts] for function in (np.cos, np.sin)]
+        return [
+            Force(text, 0.0, {k: 1.0}, here, wave(function, self.omega, 0)) for k, (text, function) in enumerate(waves)
+        ]
+
+    def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
+        """Return what many such waves are together."""
+        return ["a force of its own course in time"]
 
 
-def _terms(tangent: Tangent) -> list[Group]:
-    dynamics = tangent.paths[0].record.stretches.dynamics
-    real = REAL_TERMS + (SECOND_ORDER_TERMS if dynamics.order == 2 else ())
-    texts: tuple[str, ...] = COMPLEX_TERMS if dynamics.is_complex else real
-    kept = [
-        (text, f"i*({text})") if dynamics.is_complex else (text,)
-        for text in texts
-        if not too_wide(Term(text), dynamics)
-    ]
-
-    def columns(_number: int, path: Path) -> ndarray:
-        return path.answer(force_along(path, [Force(Term(text)) for texts in kept for text in texts]))
-
-    every = tangent.columns(columns)
+def left_in(fitted: Fitted, problem: Problem) -> tuple[Left, ...]:
+    """Return what is significant in the residual of a fit without having a name, the best first."""
+    terms = list(_terms(problem))
+    forces = [*LocalForce.places(Effect("force-at-one-site", "1"), problem.scene)] if problem.chain.sites > 1 else []
     found = []
-    for k, own in enumerate(kept):
-        each = len(own)
-        placed = PlacedEffect(Effect("unnamed", own[0]), own)
-        found += group(own[0], [as_candidate(tangent, placed, every[:, k * each : (k + 1) * each])])
-    return found
+    for kind in (terms, forces):
+        for one in Tangent(fitted).scored(kind):
+            share = rules.FALSE_DOUBT / 2 / max(len(kind), 1)
+            price = problem.chance(share, one.freedom)
+            if one.freedom and one.gain > price:
+                words = [*one.placed.sentences(problem.chain), *one.placed.labels(problem.chain)]
+                found.append(Left(words[0], one.gain, price, one.placed.site))
+    best: dict[tuple[str, int | None], Left] = {}
+    for left in sorted(found, key=lambda left: left.price - left.gain):
+        best.setdefault((left.name, left.site), left)
+    return tuple(best.values())
 
 
-def _bonds(tangent: Tangent) -> list[Group]:
-    """Return candidates for one bond of another strength, and for every bond of its own."""
-    dynamics = tangent.paths[0].record.stretches.dynamics
-    moving = places(tangent)
-    left_ones = [k for k in moving if k + 1 in moving]
-    if len(left_ones) < 2:
-        return []
-    parts = _parts(tangent.paths[0])
-
-    def columns(_number: int, path: Path) -> ndarray:
-        terms = [Term(f"{part}(u[n+1]-u[n])") for part in parts] + [Term(f"{part}(u[n-1]-u[n])") for part in parts]
-        right, left = np.split(path.sources(terms), 2)
-        sites = np.eye(dynamics.sites)[:, dynamics.moving]
-        return path.answer(np.concatenate([right * sites[k] + left * sites[k + 1] for k in left_ones]))
-
-    every = tangent.columns(columns)
-    placed = PlacedEffect(Effect("unnamed", "u[n+1]-u[n]"))
-    each = len(parts)
-    candidates = [as_candidate(tangent, placed, every[:, j * each : (j + 1) * each]) for j in range(len(left_ones))]
-    return [
-        *group("another bond", candidates),
-        *group("uneven bonds", [as_candidate(tangent, placed, every, random=True)]),
-    ]
-
-
-def _wires(tangent: Tangent) -> list[Group]:
-    """Return candidates for bonds between any two sites that are no neighbours."""
-    dynamics = tangent.paths[0].record.stretches.dynamics
-    moving, parts = np.array(places(tangent)), dynamics.parts
-    pairs = [(a, b) for a in range(len(moving)) for b in range(a + 2, len(moving))]
-    if len(pairs) < 2 or len(tangent.residual) * len(pairs) * parts > MOST_NUMBERS:
-        return []
-
-    def columns(_number: int, path: Path) -> ndarray:
-        field = path.field[:, 0][..., dynamics.moving]
-        found = []
-        for a in range(len(moving) - 2):
-            others = np.arange(a + 2, len(moving))
-            pull = np.zeros((len(others), len(path.times), dynamics.parts, len(moving)))
-            stretch = np.moveaxis(field[..., others] - field[..., [a]], -1, 0)
-            pull[..., a] = stretch
-            pull[np.arange(len(others)), ..., others] = -stretch
-            every = np.stack([pull, turned(pull)], axis=1).reshape(-1, *pull.shape[1:]) if path.is_complex else pull
-            found.append(path.answer(every))
-        return np.concatenate(found, axis=1)
-
-    every = tangent.columns(columns)
-    candidates = [
-        as_candidate(tangent, replace(UNNAMED, site=int(moving[a])), every[:, k * parts : (k + 1) * parts])
-        for k, (a, _) in enumerate(pairs)
-    ]
-    return group("a bond between two distant sites", candidates)
+def _terms(problem: Problem) -> Iterator[Placed]:
+    chain = problem.chain
+    texts: tuple[str, ...] = REAL_TERMS + (SECOND_ORDER_TERMS if chain.order == 2 else ())
+    for text in COMPLEX_TERMS if chain.is_complex else texts:
+        if max(Term(text).reach) <= chain.reach:
+            both = (text, f"i*({text})")[: chain.parts]
+            yield Everywhere(effect=Effect("unnamed", text), texts=both, strength=(0.0,) * len(both))

@@ -10,18 +10,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.parser import TermError, parse
 
-Acts = Literal[
-    "everywhere", "harmonic", "pulse", "delayed", "long range", "alternating", "one site", "one equation", "every site",
-    "ends", "offset", "gain", "curve", "clock", "rounding",
-]  # fmt: skip
-"""How an effect acts; `HOW` explains each way."""
-
-HOW: dict[Acts, str] = {
+HOW: dict[str, str] = {
     "everywhere": "the formula, at every site and time",
     "harmonic": "the formula times cos(omega t) and sin(omega t), at every site alike; omega found",
     "pulse": "the formula times exp(-((t - at) / width)^2 / 2), at every site alike; at and width found",
@@ -35,11 +28,9 @@ HOW: dict[Acts, str] = {
     "offset": "the reading is u + b; at one site, which is found, or with a b for every site",
     "gain": "the reading is g u; at one site, which is found, or with a g for every site",
     "curve": "the reading is u + c u^2",
-    "clock": "the recorded times are wrong: all scaled, or each slightly off",
-    "rounding": "the reading is a multiple of a step",
+    "clock": "the recorded times are wrong by a share of themselves",
 }
-
-INSTRUMENT: tuple[Acts, ...] = ("offset", "gain", "curve", "clock", "rounding")
+"""The ways of acting, each with what it does; `latticebench.diagnosis.acting` has one class for each."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +55,7 @@ class Effect:
 
     name: str
     formula: str
-    acts: Acts = "everywhere"
+    acts: str = "everywhere"
     first_order: str | None = None
     complex_field: str | None = None
     real: bool = False
@@ -79,8 +70,8 @@ class Effect:
             raise InputError(
                 f"effect {self.name!r}: a name is small letters, digits and single dashes, such as dry-friction"
             )
-        if self.acts not in get_args(Acts):
-            raise unknown("way of acting", str(self.acts), get_args(Acts), f"effect {self.name!r}")
+        if self.acts not in HOW:
+            raise unknown("way of acting", str(self.acts), HOW, f"effect {self.name!r}")
         if not (self.formula or self.first_order or self.complex_field):
             raise InputError(f"effect {self.name!r}: it has no formula")
         for text in (self.formula, self.first_order, self.complex_field):
@@ -89,6 +80,16 @@ class Effect:
                     parse(text)
                 except TermError as error:
                     raise InputError(f"effect {self.name!r}: {error}") from None
+
+    @property
+    def how(self) -> str:
+        """What its way of acting does, in words."""
+        return HOW[self.acts]
+
+    @property
+    def is_a_term(self) -> bool:
+        """Whether it is its formula at every site and time, so that an equation may declare it."""
+        return self.acts == "everywhere"
 
     def texts(self, order: int, is_complex: bool) -> tuple[str, ...]:
         """Return the terms on a lattice: T, or T and i*T for a complex coefficient; none if it has no meaning there."""
@@ -233,9 +234,5 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "clock", "v[n]", acts="clock",
         look_for="a residual in proportion to the velocity, at all sites at once", source=LJUNG,
-    ),
-    Effect(
-        "quantisation", "u[n]", acts="rounding",
-        look_for="readings that are multiples of a step", source="Widrow & Kollar, Quantization Noise (2008)",
     ),
 )  # fmt: skip

@@ -1,0 +1,12 @@
+"""Ways of acting, one file each: where an effect may be, what it does to motion or readings, and how it is said."""
+
+import importlib
+import pkgutil
+
+from latticebench.diagnosis.acting.placed import WAYS, Chain, Force, Misreading, Placed, Scene, Summand, way_of
+
+# Every file of this folder makes its way of acting known.
+for _module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{_module.name}")
+
+__all__ = ["WAYS", "Chain", "Force", "Misreading", "Placed", "Scene", "Summand", "way_of"]

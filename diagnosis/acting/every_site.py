@@ -1,0 +1,62 @@
+"""A term at every site, with a coefficient of its own at each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from latticebench.diagnosis.acting.placed import Chain, Force, Placed, Scene
+from latticebench.systems.effects import Effect
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EverySite(Placed, acts="every site"):
+    """A term at every site with a coefficient of its own.
+
+    Attributes:
+        texts: T, or T and i*T for complex coefficients.
+        whole: whether the coefficients are free; else only their deviations from a mean that the model has already, so
+            that those of the last site are what makes their sum 0.
+    """
+
+    texts: tuple[str, ...]
+    whole: bool
+    local: ClassVar[bool] = True
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return the one place, on a chain of at least three sites: with fewer, one site can be named."""
+        texts, chain = scene.terms(effect), scene.chain
+        if texts and len(chain.moving) > 2 and len(chain.moving) == chain.sites:
+            whole = not set(texts) <= set(scene.texts)
+            yield cls(
+                effect=effect, texts=texts, whole=whole, strength=(0.0,) * ((chain.sites - (not whole)) * len(texts))
+            )
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:
+        """Return the terms with their sites."""
+        return tuple(f"{text} at site {k + 1}" for text in self.texts for k in range(chain.sites - (not self.whole)))
+
+    def forces(self, chain: Chain) -> list[Force]:
+        """Return a term for every site."""
+        each = np.eye(chain.sites)
+        if not self.whole:
+            each = each[:-1] - each[-1]
+        places = [(text, row) for text in self.texts for row in each]
+        return [Force(text, self.strength[k], {k: 1.0}, row) for k, (text, row) in enumerate(places)]
+
+    def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
+        """Return how the coefficients scatter."""
+        each = np.reshape(self.strength, (len(self.texts), -1))
+        named = " and ".join(self.texts)
+        if self.whole:
+            about = f"mean {np.mean(each):.3g}, standard deviation {np.std(each):.3g}"
+        else:
+            each = np.concatenate([each, -np.sum(each, axis=1, keepdims=True)], axis=1)
+            about = (
+                f"deviations from their mean, which belongs to {named} itself; standard deviation {np.std(each):.3g}"
+            )
+        return [f"every site has {named} besides, with a coefficient of its own: {about}"]

@@ -1,0 +1,89 @@
+"""A sensor that reads too much or too little."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, Placed, Scene
+from latticebench.systems.effects import Effect
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gain(Placed, acts="gain"):
+    """The reading is (1 + strength) u, with a strength for each of some sites.
+
+    Attributes:
+        sites: those that read wrongly, from 0.
+        both: whether velocities are read so, too.
+    """
+
+    sites: tuple[int, ...]
+    both: bool
+    instrument: ClassVar[bool] = True
+    local: ClassVar[bool] = True
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return every site, and all but the first at once: what the first one reads is the unit."""
+        chain = scene.chain
+        if not effect.texts(chain.order, chain.is_complex):
+            return
+        others = chain.moving[1:]
+        for both in (False, True)[: chain.levels]:
+            # Where all sensors of a single level share a factor, that is a unit.
+            single = [(site,) for site in chain.moving] if chain.sites > 1 or chain.levels > 1 else []
+            for sites in [*single, *([others] if len(others) > 1 else [])]:
+                yield cls(effect=effect, sites=sites, both=both, strength=(0.0,) * len(sites))
+
+    @property
+    def site(self) -> int | None:
+        """The site, where it is one."""
+        return self.sites[0] if len(self.sites) == 1 else None
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect, the sites, and whether velocities are concerned."""
+        return (self.effect.name, self.sites, self.both)
+
+    def turned(self) -> Placed | None:
+        """Return the sensor with the other sign."""
+        return None if self.site is None else self.moved([-2.0 - self.strength[0]])
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:
+        """Return the columns that are read wrongly."""
+        return tuple(f"gain of {self._column(site, chain)}" for site in self.sites)
+
+    def _column(self, site: int, chain: Chain) -> str:
+        if chain.is_complex:
+            return f"re{site + 1} and im{site + 1}"
+        return f"u{site + 1}" + (f" and v{site + 1}" if self.both else "")
+
+    def misread(self, t: ndarray, field: ndarray, rate: ndarray) -> Misreading:  # noqa: ARG002
+        """Return what the factors add."""
+        by, slope = np.zeros((len(self.strength), *field.shape)), np.zeros_like(field)
+        levels = slice(None) if self.both else slice(0, 1)
+        for k, site in enumerate(self.sites):
+            by[k, :, levels, :, site] = field[:, levels, :, site]
+            slope[:, levels, :, site] = self.strength[k]
+        return Misreading(np.tensordot(self.strength, by, 1), slope, by)
+
+    def natural(self, chain: Chain, frequency: float) -> dict[str, float]:  # noqa: ARG002
+        """Return the factors."""
+        pairs = zip(self.sites, self.strength, strict=True)
+        return {f"factor of {self._column(site, chain)}": 1 + value for site, value in pairs}
+
+    def sentences(self, chain: Chain) -> list[str]:
+        """Return the factors."""
+        found = []
+        for site, value in zip(self.sites, self.strength, strict=True):
+            factor, column = 1 + value, self._column(site, chain)
+            turned = "; it looks from the other side" if factor < 0 else ""
+            found.append(f"the sensor of {column} reads {factor:.{DIGITS}g} times what the others' unit says{turned}")
+        return found

@@ -1,0 +1,91 @@
+"""A term that swings at a frequency of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from latticebench.diagnosis.acting.placed import Chain, Force, Placed, Scene, Summand
+from latticebench.methods.engine.dynamics import Factor
+from latticebench.systems.effects import Effect
+from latticebench.systems.terms import Term
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Harmonic(Placed, acts="harmonic"):
+    """A term times a cos(omega t) + b sin(omega t), at every site alike.
+
+    Attributes:
+        texts: T, or T and i*T for complex coefficients.
+        omega: angular frequency, one over the unit of time.
+    """
+
+    texts: tuple[str, ...]
+    omega: float
+    shape: ClassVar[tuple[str, ...]] = ("omega",)
+    timed: ClassVar[bool] = True
+    separated_by: ClassVar[str] = (
+        "another recording, begun at another time: what is driven from outside keeps its own time, whatever the chain "
+        "does"
+    )
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return every frequency of the scene."""
+        texts = scene.terms(effect)
+        for omega in scene.frequencies if texts else ():
+            yield cls(effect=effect, texts=texts, omega=float(omega), strength=(0.0,) * (2 * len(texts)))
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
+        """Return cosine and sine of each term."""
+        waves = (f"{name}({self.omega:.6g}*t)" for name in ("cos", "sin"))
+        return tuple(wave if text == "1" else f"{wave}*{text}" for wave in waves for text in self.texts)
+
+    @property
+    def near(self) -> tuple[object, ...]:
+        """The effect and its frequency, to two digits."""
+        return (self.effect.name, f"{self.omega:.2g}")
+
+    @property
+    def frequency(self) -> float:
+        """The angular frequency."""
+        return self.omega
+
+    def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
+        """Return the waves and, for the frequency, their derivatives by it."""
+        last, count, found = len(self.strength), len(self.texts), []
+        for k, text in enumerate(self.texts):
+            a, b = self.strength[k], self.strength[count + k]
+            found += [
+                Force(text, a, {k: 1.0}, None, wave(np.cos, self.omega, 0)),
+                Force(text, b, {count + k: 1.0}, None, wave(np.sin, self.omega, 0)),
+            ]
+            if a or b:
+                found += [
+                    Force(text, 0.0, {last: -a}, None, wave(np.sin, self.omega, 1)),
+                    Force(text, 0.0, {last: b}, None, wave(np.cos, self.omega, 1)),
+                ]
+        return found
+
+    def summands(self, chain: Chain) -> list[Summand]:
+        """Return the waves."""
+        import sympy
+
+        phase = sympy.Float(self.omega, 6) * sympy.Symbol("t", real=True)
+        bodies = [wave(phase) * Term(text).in_decimals for wave in (sympy.cos, sympy.sin) for text in self.texts]
+        return [Summand(*one) for one in zip(self.labels(chain), self.strength, bodies, strict=True)]
+
+
+def wave(function: Callable[[ndarray], ndarray], omega: float, power: int) -> Factor:
+    """Return the factor t**power * function(omega * t), the same at all sites."""
+
+    def factor(t: ndarray) -> ndarray:
+        return np.asarray((t**power * function(omega * t))[None, :, None])
+
+    return factor

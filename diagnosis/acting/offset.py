@@ -1,0 +1,77 @@
+"""A sensor whose zero is off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, Placed, Scene
+from latticebench.systems.effects import Effect
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Offset(Placed, acts="offset"):
+    """The reading is u + b, with a b for each of some sites.
+
+    Attributes:
+        sites: those that are off, from 0.
+        parts: 1, or 2 for a complex field.
+        every: whether these are all sites that have an equation.
+    """
+
+    sites: tuple[int, ...]
+    parts: int
+    every: bool
+    instrument: ClassVar[bool] = True
+    local: ClassVar[bool] = True
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return every site, and all of them at once."""
+        chain = scene.chain
+        if not effect.texts(chain.order, chain.is_complex):
+            return
+        for sites in [*((site,) for site in chain.moving), *([chain.moving] if len(chain.moving) > 1 else [])]:
+            every = len(sites) == len(chain.moving)
+            yield cls(
+                effect=effect, sites=sites, parts=chain.parts, every=every, strength=(0.0,) * (len(sites) * chain.parts)
+            )
+
+    @property
+    def site(self) -> int | None:
+        """The site, where it is one."""
+        return self.sites[0] if len(self.sites) == 1 else None
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect and the sites."""
+        return (self.effect.name, self.sites)
+
+    @property
+    def from_the_start(self) -> bool:
+        """Whether it is of all sites: about a wrong zero a coupling looks like another one."""
+        return self.every
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
+        """Return the columns that are off."""
+        columns = ("re", "im") if self.parts == 2 else ("u",)
+        return tuple(f"offset of {name}{site + 1}" for site in self.sites for name in columns)
+
+    def misread(self, t: ndarray, field: ndarray, rate: ndarray) -> Misreading:  # noqa: ARG002
+        """Return the offsets, and what each adds."""
+        by = np.zeros((len(self.strength), *field.shape))
+        for k, site in enumerate(self.sites):
+            for part in range(self.parts):
+                by[k * self.parts + part, :, 0, part, site] = 1.0
+        return Misreading(np.tensordot(self.strength, by, 1), np.zeros_like(field), by)
+
+    def sentences(self, chain: Chain) -> list[str]:
+        """Return how far each sensor is off."""
+        pairs = zip(self.labels(chain), self.strength, strict=True)
+        return [f"{label}: {value:.{DIGITS}g}" for label, value in pairs]

@@ -1,0 +1,305 @@
+"""An effect in its place: the terms that it adds to the equation, what it makes of the readings, and how it is said.
+
+Each way of acting is one class in one file of this folder, a subclass of `Placed`; it is known by the text that an
+effect of the catalogue has in its field `acts`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from latticebench.methods.engine.dynamics import Factor
+from latticebench.systems.effects import HOW, Effect
+from latticebench.systems.stencil import Ends
+from latticebench.systems.terms import Term
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    import sympy
+    from jaxtyping import Float
+    from numpy import ndarray
+
+WAYS: dict[str, type[Placed]] = {}
+"""The ways of acting by name."""
+
+DIGITS = 4
+# On fewer sites a dependence on the place cannot be told from what single sites have.
+PLACES = 4
+# What tells instrument from motion, and one site from all.
+OTHER_SENSORS = (
+    "the same motion read by other sensors, or by these at other sites: a fault goes with the sensor, physics stays "
+    "with the site"
+)
+ELSEWHERE = "a motion that is large elsewhere in the chain: what sits at one site is felt only there"
+
+
+@dataclass(frozen=True)
+class Chain:
+    """What an effect has to know of the lattice that it acts on.
+
+    Attributes:
+        sites: N.
+        order: of the time derivative.
+        is_complex: whether the field is complex.
+        levels: 1 where u is read, 2 where its velocity is, too.
+        ends: how the chain ends.
+        moving: the sites that have an equation, from 0.
+        reach: the widest stencil that terms may have, to either side.
+    """
+
+    sites: int
+    order: int
+    is_complex: bool
+    levels: int
+    ends: Ends
+    moving: tuple[int, ...]
+    reach: int
+
+    @property
+    def parts(self) -> int:
+        """1 for a real field, 2 for a complex one."""
+        return 1 + self.is_complex
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is known of the recordings before anything is fitted; effects are placed in it.
+
+    Attributes:
+        chain: the lattice.
+        begin, span: the first time, and the length of the longest recording.
+        top: the highest angular frequency that the readings plainly show.
+        frequencies: angular frequencies that an outside influence may have.
+        past: the smoothed field of each recording as a function of times, (B,) -> (parts, B, N).
+        texts: the declared terms.
+        inputs: whether an input was measured.
+    """
+
+    chain: Chain
+    begin: float
+    span: float
+    top: float
+    frequencies: Float[ndarray, " frequencies"]
+    past: tuple[Factor, ...]
+    texts: tuple[str, ...]
+    inputs: bool
+
+    def terms(self, effect: Effect) -> tuple[str, ...]:
+        """Return the terms of an effect on this lattice; none where it has no meaning there."""
+        texts = effect.texts(self.chain.order, self.chain.is_complex)
+        for text in texts:
+            term = Term(text)
+            if ("f" in term.names and not self.inputs) or max(term.reach) > self.chain.reach:
+                return ()
+            if "n" in term.names and len(self.chain.moving) < PLACES:
+                return ()
+        return texts
+
+
+@dataclass(frozen=True, eq=False)
+class Force:
+    """One term of the right-hand side: coefficient * weights[n] * factor(t) * text.
+
+    Attributes:
+        text: in the term language.
+        coefficient: its value.
+        by: derivatives of the coefficient by the numbers of the effect, as far as they are not zero.
+        weights: of each site (N,); None for 1.
+        factor: of time, see `methods.engine.dynamics.Dynamics`: one for all recordings or one for each; None for 1.
+    """
+
+    text: str
+    coefficient: float
+    by: Mapping[int, float]
+    weights: Float[ndarray, " sites"] | None = None
+    factor: Factor | tuple[Factor, ...] | None = None
+
+    def factor_of(self, recording: int) -> Factor | None:
+        """Return the factor of one recording."""
+        if isinstance(self.factor, tuple):
+            return self.factor[min(recording, len(self.factor) - 1)]
+        return self.factor
+
+
+@dataclass(frozen=True, eq=False)
+class Misreading:
+    """What an instrument adds to the readings of a field.
+
+    Attributes:
+        added: (rows, levels, parts, N), in units of the readings.
+        slope: its derivative by the reading's own field, likewise; dimensionless.
+        by: its derivatives by the numbers of the effect (numbers, rows, levels, parts, N).
+    """
+
+    added: Float[ndarray, "rows levels parts sites"]
+    slope: Float[ndarray, "rows levels parts sites"]
+    by: Float[ndarray, "numbers rows levels parts sites"]
+
+
+@dataclass(frozen=True, eq=False)
+class Summand:
+    """A term that acts at every site: its text, its coefficient, and what it is multiplied with in mathematics."""
+
+    text: str
+    coefficient: float
+    body: sympy.Expr
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Placed(ABC):
+    """An effect of the catalogue in its place, with its numbers.
+
+    The numbers are the strengths, in which what it does is linear, and the fields that `shape` names.
+
+    Attributes:
+        effect: of the catalogue.
+        strength: coefficients, one per label.
+        shape: names of the fields that a fit changes besides.
+        instrument: whether it acts on readings, not on the motion.
+        timed: whether it has a frequency or a time of its own; it can then stand in for much on short horizons.
+        linear: whether a score test can rank it; else it is tried outright.
+        local: whether it acts at single sites, or at each differently.
+        separated_by: the measurement that tells this way of acting from others; nothing where none is known.
+    """
+
+    effect: Effect
+    strength: tuple[float, ...]
+    shape: ClassVar[tuple[str, ...]] = ()
+    instrument: ClassVar[bool] = False
+    timed: ClassVar[bool] = False
+    linear: ClassVar[bool] = True
+    local: ClassVar[bool] = False
+    separated_by: ClassVar[str] = ""
+
+    def __init_subclass__(cls, acts: str = "", how: str = "") -> None:
+        """Make a way of acting known by its name; `how` explains it where `systems.effects.HOW` does not."""
+        super().__init_subclass__()
+        if acts:
+            WAYS[acts] = cls
+            HOW.setdefault(acts, how)
+
+    @classmethod
+    @abstractmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return the effect at every place where it may be, of strength zero."""
+
+    @abstractmethod
+    def labels(self, chain: Chain) -> tuple[str, ...]:
+        """Return what each strength is the coefficient of."""
+
+    @property
+    def site(self) -> int | None:
+        """The single site where it acts, from 0; None where there is no such site."""
+        return None
+
+    @property
+    def numbers(self) -> Float[ndarray, " numbers"]:
+        """All numbers that a fit changes."""
+        return np.array([*self.strength, *(getattr(self, name) for name in self.shape)], dtype=float)
+
+    def moved(self, numbers: Sequence[float] | Float[ndarray, " numbers"]) -> Self:
+        """Return the same effect with other numbers."""
+        count = len(self.strength)
+        fields: dict[str, Any] = dict(zip(self.shape, map(float, numbers[count:]), strict=True))
+        return replace(self, strength=tuple(map(float, numbers[:count])), **fields)
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """What distinguishes it from the same effect elsewhere, numbers apart."""
+        return (self.effect.name,)
+
+    @property
+    def near(self) -> tuple[object, ...]:
+        """The place, with the numbers of `shape` roughly."""
+        return self.place
+
+    @property
+    def frequency(self) -> float | None:
+        """The angular frequency at which it swings; None where it has none of its own."""
+        return None
+
+    def begun(self, t: float) -> bool:  # noqa: ARG002
+        """Return whether readings before a time show it."""
+        return True
+
+    def with_past(self, past: Factor) -> Self:  # noqa: ARG002
+        """Return it with another field at earlier times, (B,) -> (parts, B, N), where it depends on that."""
+        return self
+
+    def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
+        """Return the terms that it adds to the right-hand side."""
+        return []
+
+    def scaled(self) -> int | None:
+        """Return the site whose whole right-hand side is multiplied by 1 + the strength; None where there is none."""
+        return None
+
+    def other_ends(self) -> Ends | None:
+        """Return how the chain ends instead of as declared; None where that does not change."""
+        return None
+
+    def misread(self, t: ndarray, field: ndarray, rate: ndarray) -> Misreading:
+        """Return what the instrument makes of a field (rows, levels, parts, N); `rate` is its time derivative."""
+        raise NotImplementedError(f"{self.effect.name} acts on the motion, not on readings")
+
+    @property
+    def from_the_start(self) -> bool:
+        """Whether it is tried before anything is known: without it, the numbers of the equation may lead astray."""
+        return False
+
+    @property
+    def turns(self) -> bool:
+        """Whether it says that a sensor looks from the other side."""
+        return self.turned() is not None and self.strength[0] < -1
+
+    def turned(self) -> Placed | None:
+        """Return the same with a sensor that looks from the other side; None for what is no single sensor."""
+        return None
+
+    def settings(self) -> dict[str, float | int | str]:
+        """Return where and how it acts, for people: the site (from 1), a frequency, a delay, ..."""
+        found: dict[str, float | int | str] = {} if self.site is None else {"site": self.site + 1}
+        return found | {name: float(getattr(self, name)) for name in self.shape}
+
+    def natural(self, chain: Chain, frequency: float) -> dict[str, float]:  # noqa: ARG002
+        """Return its numbers in the form in which people know them, by what they are: factors, mass ratios, times.
+
+        Args:
+            chain: the lattice.
+            frequency: the lowest angular frequency of the recording; NaN where none is known.
+        """
+        return dict(zip([*self.labels(chain), *self.shape], map(float, self.numbers), strict=True))
+
+    @classmethod
+    def separated_from(cls, other: type[Placed]) -> str:
+        """Return which measurement would tell this way of acting from another; nothing where both act alike."""
+        if cls.instrument != other.instrument:
+            return (cls if cls.instrument else other).separated_by or OTHER_SENSORS
+        if cls.local != other.local:
+            return ELSEWHERE
+        # The same for either order of the two.
+        return "" if cls is other else max(cls.separated_by, other.separated_by)
+
+    def summands(self, chain: Chain) -> list[Summand]:  # noqa: ARG002
+        """Return the terms that it brings to every site's equation."""
+        return []
+
+    def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
+        """Return in words what it does that is no term of every site."""
+        return []
+
+
+def times(value: float, text: str) -> str:
+    """Return a coefficient times a term as text."""
+    return f"{value:.{DIGITS}g}" if text == "1" else f"{value:.{DIGITS}g}*{text}"
+
+
+def way_of(effect: Effect) -> type[Placed]:
+    """Return the way of acting of an effect of the catalogue."""
+    return WAYS[effect.acts]

@@ -1,0 +1,93 @@
+"""A term that acts for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Placed, Scene, Summand
+from latticebench.methods.engine.dynamics import Factor
+from latticebench.systems.effects import Effect
+from latticebench.systems.terms import Term
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+# Middles that are tried of each width, at most, and the ratio of one width to the next.
+MOST_MIDDLES, WIDER = 60, 3.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pulse(Placed, acts="pulse"):
+    """A term times exp(-((t - at) / width)^2 / 2), at every site alike.
+
+    Attributes:
+        texts: T, or T and i*T for a complex coefficient.
+        at, width: in the unit of time.
+    """
+
+    texts: tuple[str, ...]
+    at: float
+    width: float
+    shape: ClassVar[tuple[str, ...]] = ("at", "width")
+    timed: ClassVar[bool] = True
+    separated_by: ClassVar[str] = (
+        "another recording, begun at another time: what is driven from outside keeps its own time, whatever the chain "
+        "does"
+    )
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return pulses of several widths all over the recording."""
+        texts, width = scene.terms(effect), 1.0 / scene.top
+        while texts and width < scene.span / 6:
+            for at in scene.begin + np.arange(0, scene.span, max(1.5 * width, scene.span / MOST_MIDDLES)):
+                yield cls(effect=effect, texts=texts, at=float(at), width=width, strength=(0.0,) * len(texts))
+            width *= WIDER
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
+        """Return the pulse of each term."""
+        shape = f"exp(-((t-{self.at:.6g})/{abs(self.width):.6g})**2/2)"
+        return tuple(shape if text == "1" else f"{shape}*{text}" for text in self.texts)
+
+    @property
+    def near(self) -> tuple[object, ...]:
+        """The effect and its middle, to a width."""
+        return (self.effect.name, f"{self.at / max(abs(self.width), 1e-300):.0f}")
+
+    def begun(self, t: float) -> bool:
+        """Return whether its middle is before a time: later, its strength is not known."""
+        return self.at <= t
+
+    def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
+        """Return the pulse and, for middle and width, its derivatives by them."""
+        last, found = len(self.strength), []
+        for k, (text, a) in enumerate(zip(self.texts, self.strength, strict=True)):
+            found.append(Force(text, a, {k: 1.0}, None, self._factor(0)))
+            if a:
+                found.append(Force(text, 0.0, {last: a / self.width}, None, self._factor(1)))
+                found.append(Force(text, 0.0, {last + 1: a / self.width}, None, self._factor(2)))
+        return found
+
+    def _factor(self, power: int) -> Factor:
+        def factor(t: ndarray) -> ndarray:
+            x = (t - self.at) / self.width
+            return np.asarray((x**power * np.exp(-(x**2) / 2))[None, :, None])
+
+        return factor
+
+    def summands(self, chain: Chain) -> list[Summand]:
+        """Return the pulse."""
+        import sympy
+
+        t = sympy.Symbol("t", real=True)
+        square = (t - sympy.Float(self.at, DIGITS)) ** 2
+        # Unevaluated, so that the numbers stand where a reader looks for them.
+        below = sympy.Mul(2, sympy.Pow(sympy.Float(abs(self.width), DIGITS), 2, evaluate=False), evaluate=False)
+        exponent = sympy.Mul(-1, square, sympy.Pow(below, -1, evaluate=False), evaluate=False)
+        body = sympy.exp(sympy.UnevaluatedExpr(exponent))
+        bodies = [body * Term(text).in_decimals for text in self.texts]
+        return [Summand(*one) for one in zip(self.labels(chain), self.strength, bodies, strict=True)]

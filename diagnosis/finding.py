@@ -1,0 +1,135 @@
+"""What a diagnosis names: an effect with its size and its evidence, and the effects that it cannot be told from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.acting import Placed
+from latticebench.diagnosis.fitting import Fitted
+from latticebench.diagnosis.search import CHANGED, Search
+
+# Alternatives of an effect that are fitted in full, each of another name, and the share of its evidence that their
+# score must come to.
+MOST_ALTERNATIVES, COMPARABLE = 3, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """An effect of the last model.
+
+    Attributes:
+        placed: the effect in its place.
+        alternatives: effects that these readings cannot tell from it.
+        evidence: nats that it brings.
+        values: value and standard error, by label of a strength or name of a field in `shape`.
+    """
+
+    placed: Placed
+    alternatives: tuple[str, ...]
+    evidence: float
+    values: Mapping[str, tuple[float, float]]
+
+    @property
+    def name(self) -> str:
+        """The name of the effect."""
+        return self.placed.effect.name
+
+    @property
+    def site(self) -> int | None:
+        """The single site where it acts, from 0."""
+        return self.placed.site
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A model whose effects have been tried without and in exchange for others.
+
+    Attributes:
+        fitted: the model, the best that was met.
+        evidence: of each effect.
+        alternatives: of each effect.
+    """
+
+    fitted: Fitted
+    evidence: tuple[float, ...]
+    alternatives: tuple[tuple[str, ...], ...]
+
+
+def compared(search: Search, fitted: Fitted) -> Compared:
+    """Try a model without each of its effects, and with others in its place; a better model takes its place."""
+    for _ in range(2 * rules.MOST_EFFECTS):
+        better, evidence, alternatives = None, [], []
+        for number in range(len(fitted.model.effects)):
+            found = _exchanged(search, fitted, number)
+            best = min(found.models, key=search.value, default=fitted)
+            if search.value(best) < search.value(fitted) - search_margin(best, fitted):
+                better = best
+                break
+            evidence.append(found.evidence)
+            alternatives.append(found.equal)
+        if better is None:
+            return Compared(fitted, tuple(evidence), tuple(alternatives))
+        fitted = better
+    return Compared(fitted, tuple(evidence), tuple(alternatives))
+
+
+def search_margin(one: Fitted, other: Fitted) -> float:
+    """Return by how much one model must be better to replace another: less with fewer effects."""
+    return 0.0 if len(one.model.effects) < len(other.model.effects) else 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Exchange:
+    """What an effect brings, models without it or with another in its place, and names of those that do as well."""
+
+    evidence: float
+    models: tuple[Fitted, ...]
+    equal: tuple[str, ...]
+
+
+def _exchanged(search: Search, fitted: Fitted, number: int) -> _Exchange:
+    placed = fitted.model.effects[number]
+    without = search.without(fitted, number)
+    evidence = float("inf") if without is None else without.cost - fitted.cost
+    models, equal = [] if without is None else [without], []
+    for found in _rivals(search, fitted, without, number, evidence):
+        models.append(found)
+        name = found.model.effects[-1].effect.name
+        if found.cost < fitted.cost + rules.EQUAL and name != placed.effect.name:
+            equal.append(name)
+    return _Exchange(float(evidence), tuple(models), tuple(dict.fromkeys(equal)))
+
+
+def _rivals(search: Search, fitted: Fitted, without: Fitted | None, number: int, evidence: float) -> Iterator[Fitted]:
+    """Yield fits with the best candidates in the place of an effect, from the models with it and without it."""
+    placed, names = fitted.model.effects[number], set()
+    for one in search.standing_in(fitted, number)[:MOST_ALTERNATIVES]:
+        names.add(one.placed.effect.name)
+        plain = replace(fitted.model, effects=(*fitted.model.without(number).effects, one.placed))
+        found = search.refit(plain, fitted.layout, fitted.followed.nodes, fitted, CHANGED)
+        if found is not None:
+            yield found
+    if without is None:
+        return
+    for one in search.screened(without, timed=placed.timed):
+        name = one.placed.effect.name
+        enough = one.gain > COMPARABLE * evidence or not one.placed.linear
+        if name not in names and enough and len(names) < MOST_ALTERNATIVES and one.placed.place != placed.place:
+            names.add(name)
+            found = search.with_effect(without, one.placed)
+            if found is not None:
+                yield found
+
+
+def findings(found: Compared) -> tuple[Finding, ...]:
+    """Return what the model names."""
+    model, errors = found.fitted.model, found.fitted.stderr
+    every = []
+    for k, (placed, block) in enumerate(zip(model.effects, model.blocks, strict=True)):
+        names = (*placed.labels(found.fitted.chain), *placed.shape)
+        numbers = zip(placed.numbers, errors[block], strict=True)
+        values = {name: (float(value), float(error)) for name, (value, error) in zip(names, numbers, strict=True)}
+        every.append(Finding(placed, found.alternatives[k], found.evidence[k], values))
+    return tuple(every)

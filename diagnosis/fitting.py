@@ -1,0 +1,285 @@
+"""Maximum likelihood for a model over pieces: damped Gauss-Newton steps, with the noise of each sensor estimated along.
+
+The initial state of each piece is eliminated from the normal equations piece by piece; the numbers of the model remain.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.diagnosis.acting import Chain
+from latticebench.diagnosis.horizon import Followed, Layout, Path, fields, follow, linearised
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.noise import Noise, Rows, Structure, Whitener, estimate
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+# A fit ends where a step promises or wins fewer nats.
+ENOUGH = 0.05
+# Damping of the first step, the factors after a step that failed and one that did not, and how often one may fail.
+DAMPING, MORE, LESS, MOST_FAILURES = 1e-6, 30.0, 0.1, 5
+# Directions of the numbers that the readings do not determine, as a share of the best determined one.
+UNDETERMINED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """The linearised problem, whitened, with the initial states eliminated.
+
+    Attributes:
+        slope: derivatives by initial state and numbers, of each recording (pieces, rows * channels, S + G).
+        error: what is left (pieces, rows * channels).
+        inner: what each initial state follows: its derivatives by the numbers, last its own step (pieces, S, G + 1).
+        matrix, target: of the numbers' normal equations.
+    """
+
+    slope: tuple[Float[ndarray, "pieces readings varied"], ...]
+    error: tuple[Float[ndarray, "pieces readings"], ...]
+    inner: tuple[Float[ndarray, "pieces state numbers_1"], ...]
+    matrix: Float[ndarray, "numbers numbers"]
+    target: Float[ndarray, " numbers"]
+
+    @functools.cached_property
+    def _scaled(self) -> tuple[ndarray, ndarray, ndarray]:
+        scale = np.sqrt(np.maximum(np.diag(self.matrix), 1e-300))
+        matrix = self.matrix / scale / scale[:, None]
+        return scale, *np.linalg.eigh((matrix + matrix.T) / 2)
+
+    def step(self, damping: float) -> Float[ndarray, " numbers"]:
+        """Return the change of the numbers; none in directions that the readings do not determine."""
+        scale, values, vectors = self._scaled
+        held = values > UNDETERMINED
+        inverse = np.where(held, 1 / (np.where(held, values, 1.0) + damping), 0.0)
+        return np.asarray(vectors @ (inverse * (vectors.T @ (self.target / scale))) / scale)
+
+    def covariance(self) -> Float[ndarray, "numbers numbers"]:
+        """Return the covariance of the numbers; vast where the readings do not determine them."""
+        scale, values, vectors = self._scaled
+        return np.asarray((vectors / np.maximum(values, 1e-3 * UNDETERMINED)) @ vectors.T / scale / scale[:, None])
+
+    def promised(self, change: Float[ndarray, " numbers"]) -> float:
+        """Return how many nats a step wins as far as the problem is linear."""
+        total = float(self.target @ change)
+        for error, slope, inner in zip(self.error, self.slope, self.inner, strict=True):
+            right = np.einsum("prs,pr->ps", slope[:, :, : inner.shape[1]], error)
+            total += float(np.sum(right * inner[:, :, -1]))
+        return total / 2
+
+
+def whitened(followed: Followed, noise: Noise, rows: Rows) -> tuple[Whitener, ndarray, ndarray, ndarray]:
+    """Return the whitener, what is left and its derivatives in independent numbers, and the robust weights' roots."""
+    seen = np.isfinite(followed.left)
+    whitener = noise.whitener(followed.level, rows, seen)
+    error = whitener.apply(np.where(seen, followed.left, 0.0))
+    robust = whitener.robust(error)
+    return whitener, error * robust, whitener.apply(followed.slope) * robust[..., None], robust
+
+
+def by_pieces(layout: Layout, flat: Float[ndarray, "rows channels *more"]) -> list[ndarray]:
+    """Return rows of all recordings as pieces of each (pieces, m * channels, ...)."""
+    found, begin = [], 0
+    for rows in layout.rows:
+        part = flat[begin : begin + rows.size]
+        found.append(part.reshape(rows.shape[0], rows.shape[1] * flat.shape[1], *flat.shape[2:]))
+        begin += rows.size
+    return found
+
+
+def normal(layout: Layout, error: ndarray, slope: ndarray, size: int, damping: float) -> Normal:
+    """Eliminate the initial states, of `size` numbers each, from the linearised problem."""
+    errors, slopes = by_pieces(layout, error), by_pieces(layout, slope)
+    count = slope.shape[-1] - size
+    matrix, target, inner = np.zeros((count, count)), np.zeros(count), []
+    for left, by in zip(errors, slopes, strict=True):
+        gram = np.swapaxes(by, 1, 2) @ by
+        right = (np.swapaxes(by, 1, 2) @ left[..., None])[..., 0]
+        unit, divided = scaled_inverse(gram[:, :size, :size], damping)
+        both = np.concatenate([gram[:, :size, size:], right[:, :size, None]], axis=2)
+        x = (divided @ (both / unit[:, :, None])) / unit[:, :, None]
+        across = np.swapaxes(gram[:, :size, size:], 1, 2)
+        matrix += np.sum(gram[:, size:, size:] - across @ x[:, :, :-1], axis=0)
+        target += np.sum(right[:, size:] - (across @ x[:, :, -1:])[..., 0], axis=0)
+        inner.append(x)
+    return Normal(tuple(slopes), tuple(errors), tuple(inner), matrix, target)
+
+
+def scaled_inverse(gram: Float[ndarray, "pieces state state"], damping: float) -> tuple[ndarray, ndarray]:
+    """Return scales, and the inverses of matrices that are divided by them on both sides and damped."""
+    unit = np.sqrt(np.maximum(np.einsum("pss->ps", gram), 1e-300))
+    scaled = gram / unit[:, :, None] / unit[:, None, :]
+    scaled[:, np.arange(gram.shape[1]), np.arange(gram.shape[1])] += damping + 1e-11
+    return unit, np.linalg.inv(scaled)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """What a model makes of one recording, at its rows in order.
+
+    Attributes:
+        t: times (T,).
+        seen: readings (T, levels, parts, N), NaN where nothing was read or the site has no equation.
+        level: what the instruments read of the motion, likewise.
+        field: the motion (T, order, parts, N).
+    """
+
+    t: Float[ndarray, " time"]
+    seen: Float[ndarray, "time levels parts sites"]
+    level: Float[ndarray, "time levels parts sites"]
+    field: Float[ndarray, "time order parts sites"]
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model fitted to pieces.
+
+    Attributes:
+        layout: the pieces.
+        followed: the model along them.
+        noise: of every sensor.
+        cost: minus the logarithm of the likelihood, in nats.
+        covariance: of the model's numbers.
+        converged: whether the steps came to an end.
+        rows: times and sensors of the readings.
+    """
+
+    layout: Layout
+    followed: Followed
+    noise: Noise
+    cost: float
+    covariance: Float[ndarray, "numbers numbers"]
+    converged: bool
+    rows: Rows
+
+    @property
+    def model(self) -> Model:
+        """The model with its numbers."""
+        return self.followed.model
+
+    @property
+    def chain(self) -> Chain:
+        """The lattice."""
+        return self.layout.chain
+
+    @property
+    def pieces(self) -> int:
+        """Pieces that it was followed over, of all recordings."""
+        return self.layout.pieces
+
+    @property
+    def longest(self) -> int:
+        """Samples of the longest piece."""
+        return self.layout.longest
+
+    @property
+    def stderr(self) -> Float[ndarray, " numbers"]:
+        """Standard errors of the model's numbers."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def rms(self) -> Float[ndarray, " sensors"]:
+        """Root mean square of what is left at each sensor, in units of the readings; NaN where nothing was read."""
+        sensors = int(np.max(self.rows.sensor)) + 1
+        squares = [self.followed.left[:, self.rows.sensor == k] ** 2 for k in range(sensors)]
+        return np.array([np.sqrt(np.nanmean(one)) if np.any(np.isfinite(one)) else np.nan for one in squares])
+
+    def curves(self) -> list[Curve]:
+        """Return what the model makes of each recording, where its pieces are."""
+        found, begin = [], 0
+        chain = self.chain
+        for number, record in enumerate(self.layout.records):
+            rows, valid = self.layout.rows[number], self.layout.valid[number].ravel()
+            flat, order = rows.ravel()[valid], self.layout.plain.order
+            shape = (len(record.times), chain.levels, chain.parts, chain.sites)
+            seen, level = np.full(shape, np.nan), np.full(shape, np.nan)
+            field = np.full((shape[0], order, *shape[2:]), np.nan)
+            part = slice(begin, begin + rows.size)
+            begin += rows.size
+            level[flat] = self.followed.level[part][valid].reshape(-1, *shape[1:])
+            seen[flat] = self.followed.left[part][valid].reshape(-1, *shape[1:]) + level[flat]
+            level[..., self.layout.plain.border] = np.nan
+            field[flat] = fields(self.layout, number, self.followed.nodes[number])[1][valid]
+            found.append(Curve(record.times, seen, level, field))
+        return found
+
+
+def fit(
+    model: Model,
+    layout: Layout,
+    near: Sequence[Float[ndarray, "pieces m state"]],
+    *,
+    structure: Structure | None,
+    noise: Noise | None = None,
+    steps: int = 20,
+) -> Fitted | None:
+    """Fit a model to pieces; None where it cannot be followed.
+
+    Args:
+        model: with the numbers to start from.
+        layout: the pieces.
+        near: states to start from, of each recording.
+        structure: of the noise; chosen by the readings if None.
+        noise: to start from.
+        steps: largest number of Gauss-Newton steps.
+    """
+    path = follow(model, layout, near)
+    followed = None if path is None else linearised(path, layout)
+    if followed is None:
+        return None
+    rows = layout.laid_out()
+    free = float(len(model.numbers) + layout.pieces * followed.size)
+    noise, cost = _likely(followed, rows, free, structure, noise)
+    damping, converged = DAMPING, False
+    for _ in range(steps):
+        found = _stepped(layout, followed, noise, rows, damping)
+        if found is None:
+            converged = True
+            break
+        followed, damping, won = found
+        noise, cost = _likely(followed, rows, free, structure, noise)
+        if won < ENOUGH:
+            converged = True
+            break
+    _, error, slope, _ = whitened(followed, noise, rows)
+    covariance = normal(layout, error, slope, followed.size, 0.0).covariance()
+    return Fitted(layout, followed, noise, cost, covariance, converged, rows)
+
+
+def _likely(
+    followed: Path, rows: Rows, free: float, structure: Structure | None, start: Noise | None
+) -> tuple[Noise, float]:
+    """Return the noise that makes what is left most likely, and the cost."""
+    noise = estimate(followed.left, followed.level, rows, free=free, structure=structure, start=start)
+    return noise, -noise.log_likelihood(followed.left, followed.level, rows)
+
+
+def _stepped(
+    layout: Layout, followed: Followed, noise: Noise, rows: Rows, damping: float
+) -> tuple[Followed, float, float] | None:
+    """Return where a step leads, the damping of the next and the nats won; None where no step wins anything."""
+    _, error, slope, _ = whitened(followed, noise, rows)
+    before, size = -noise.log_likelihood(followed.left, followed.level, rows), followed.size
+    for _ in range(MOST_FAILURES):
+        problem = normal(layout, error, slope, size, damping)
+        change = problem.step(damping)
+        if not np.all(np.isfinite(change)) or problem.promised(change) < ENOUGH / 2:
+            return None
+        near = []
+        for y, moves, inner in zip(followed.nodes, followed.moves, problem.inner, strict=True):
+            local = inner[:, :, -1] - inner[:, :, :-1] @ change
+            varied = np.concatenate([local, np.broadcast_to(change, (len(local), len(change)))], axis=1)
+            near.append(y + (varied[:, None, None] @ moves)[:, :, 0])
+        trial = follow(followed.model.moved(followed.model.numbers + change), layout, near, followed.transitions)
+        if trial is not None:
+            won = before + noise.log_likelihood(trial.left, trial.level, rows)
+            further = linearised(trial, layout) if won > -1e-6 else None
+            if further is not None:
+                return further, max(damping * LESS, 1e-9), won
+        damping = max(damping, DAMPING) * MORE
+    return None

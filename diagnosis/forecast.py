@@ -1,0 +1,167 @@
+"""Forecasts of readings that were not fitted."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.diagnosis.fitting import Fitted, fit
+from latticebench.diagnosis.horizon import Layout
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.problem import Problem
+from latticebench.methods.engine.dynamics import split_parts
+from latticebench.systems.samples import Samples
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+# The share of a recording that forecasts are judged on, and its rows, at most.
+HELD_OUT, MOST_ROWS = 0.3, 1500
+FEWEST_ROWS = 12
+STEPS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A motion predicted from a fitted state, beside what was observed.
+
+    Attributes:
+        t: times (T,).
+        seen: readings of u (T, parts, N), NaN where missing.
+        predicted: the same from the model, instrument included.
+        error: RMS of the difference over the RMS of the readings, dimensionless.
+    """
+
+    t: Float[ndarray, " time"]
+    seen: Float[ndarray, "time parts sites"]
+    predicted: Float[ndarray, "time parts sites"]
+    error: float
+
+
+def pooled(forecasts: Sequence[Prediction]) -> float:
+    """Return the root mean square error of forecasts over that of the readings; infinite where one runs away."""
+    left, size = 0.0, 0.0
+    for one in forecasts:
+        with np.errstate(all="ignore"):
+            there = np.isfinite(one.seen)
+            wrong = np.where(there, np.nan_to_num(one.predicted, nan=np.inf) - np.where(there, one.seen, 0.0), 0.0)
+            left += float(np.sum(wrong**2)) if np.all(np.isfinite(wrong)) else np.inf
+        size += float(np.nansum(one.seen**2))
+    return float(np.sqrt(left / size)) if size > 0 else float("nan")
+
+
+def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) -> list[Prediction]:
+    """Return forecasts.
+
+    Without other recordings the numbers are fitted again to the first 70 % of each, the model's effects being those of
+    `fitted`, and the rest is predicted. Of other recordings only the initial state is fitted, to their first 30 %.
+
+    Args:
+        fitted: the model.
+        problem: the recordings that it was fitted to.
+        held_out: other recordings.
+    """
+    if held_out:
+        other = Problem.of(problem.declared, problem.order, held_out, ())
+        share, steps = HELD_OUT, 0
+        model = fitted.model
+    else:
+        other, share, steps = problem, 1 - HELD_OUT, STEPS
+        model = _foreseeable(fitted.model, [one.t[round(len(one.t) * share)] for one in problem.data])
+    early = other.first(share)
+    layout = Layout.of(early, max(len(one.t) for one in early.data), None, fitted.layout.small)
+    if not held_out and fitted.longest < max(len(one.t) for one in problem.data):
+        layout = Layout.of(early, fitted.longest, None, fitted.layout.small)
+    near = [nodes[rows] for nodes, rows in zip(early.nodes, layout.rows, strict=True)]
+    if not held_out:
+        near = _from(fitted, layout, early)
+    layout = layout.with_substeps(model, near, other.top)
+    with np.errstate(all="ignore"):
+        again = fit(model, layout, near, structure=fitted.noise.structure, noise=fitted.noise, steps=max(steps, STEPS))
+    if again is None:
+        return [_lost(record.times[len(part.times) :], samples) for record, part, samples in
+                zip(other.records, early.records, other.data, strict=True)]  # fmt: skip
+    model = again.model if not held_out else model
+    return [_follow(model, again, other, number) for number in range(len(other.records))]
+
+
+def _foreseeable(model: Model, ends: Sequence[float]) -> Model:
+    """Return a model without pulses whose middle the early readings do not show: nothing is known of their strength."""
+    seen = tuple(one for one in model.effects if one.begun(max(ends)))
+    return replace(model, effects=seen)
+
+
+def _from(fitted: Fitted, layout: Layout, early: Problem) -> list[ndarray]:
+    """Return the states of a fit at the early rows."""
+    found = []
+    for number, rows in enumerate(layout.rows):
+        nodes = np.array(early.nodes[number])
+        old, valid = fitted.layout.rows[number], fitted.layout.valid[number]
+        kept = valid & (old < len(nodes))
+        nodes[old[kept]] = fitted.followed.nodes[number][kept]
+        found.append(nodes[rows])
+    return found
+
+
+def _lost(t: ndarray, samples: Samples) -> Prediction:
+    seen = split_parts(samples.u[len(samples.t) - len(t) :], samples.is_complex)
+    return Prediction(t, seen, np.full_like(seen, np.inf), float("inf"))
+
+
+def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Prediction:
+    """Return the forecast of the rest of one recording from where the early fit ends."""
+    record, samples = problem.records[number], problem.data[number]
+    rows, nodes = again.layout.rows[number], again.followed.nodes[number]
+    cut = int(np.max(rows)) + 1
+    late = record.times[cut : cut + MOST_ROWS]
+    past = _Past(record.times[rows[-1]], nodes[-1], problem)
+    model = replace(model, effects=tuple(one.with_past(past) for one in model.effects))
+    assembled = model.assembled(problem.plain, problem.chain, number)
+    state, found = nodes[-1, -1], []
+    times = np.concatenate([[record.times[cut - 1]], late])
+    stretches = replace(record.stretches, dynamics=assembled.dynamics, held=True)
+    dense = 2 * max(1, int(np.median(again.layout.substeps[number])))
+    with np.errstate(all="ignore"):
+        for begin, end in itertools.pairwise(times):
+            one = replace(stretches, begin=np.array([begin]), end=np.array([end]))
+            substeps = np.full(1, np.ceil(dense * max(1.0, (end - begin) / problem.step)), dtype=int)
+            state = one.run(assembled.coefficients, state[None], substeps, problem.splines[number])[0]
+            found.append(state)
+            past.learn(float(end), state)
+        whole = problem.plain.whole(np.stack(found), record.stretches.driven(late, problem.splines[number]))
+        field, rate = whole[:, : problem.chain.levels], np.zeros_like(whole)
+        rate[:, :-1] = whole[:, 1:]
+        predicted = field[:, 0].copy()
+        for placed, _ in model.instruments():
+            predicted += placed.misread(late, field, rate[:, : problem.chain.levels]).added[:, 0]
+        seen = split_parts(samples.u[cut : cut + MOST_ROWS], samples.is_complex)
+        seen[..., problem.plain.border] = np.nan
+        forecast = Prediction(late, seen, predicted, 0.0)
+    return replace(forecast, error=pooled([forecast]))
+
+
+class _Past:
+    """The field at earlier times of a motion that is still being followed."""
+
+    def __init__(self, times: ndarray, nodes: ndarray, problem: Problem) -> None:
+        self.times, self.nodes, self.problem = list(times), list(nodes), problem
+
+    def learn(self, t: float, state: ndarray) -> None:
+        """Add a state."""
+        self.times.append(t)
+        self.nodes.append(state)
+
+    def __call__(self, t: ndarray) -> ndarray:
+        """Return u at times (B,) that have been: (parts, B, N)."""
+        times = np.array(self.times)
+        first = max(0, int(np.searchsorted(times, np.min(t))) - 4)
+        field = self.problem.plain.whole(np.stack(self.nodes[first:]), None)[:, 0]
+        from scipy.interpolate import CubicSpline
+
+        curve = CubicSpline(times[first:], field)
+        return np.moveaxis(np.asarray(curve(np.clip(t, times[first], times[-1]))), 0, 1)

@@ -1,0 +1,375 @@
+"""What is known of recordings before a model is fitted: the lattice, smoothed states, frequencies, all candidates."""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.acting import Chain, Placed, Scene, way_of
+from latticebench.diagnosis.instrument import of_readings, step_of
+from latticebench.methods.engine.bsplines import BSplines
+from latticebench.methods.engine.derivatives import DEGREE, differentiate
+from latticebench.methods.engine.dynamics import Dynamics, Factor, split_parts
+from latticebench.methods.engine.record import Record
+from latticebench.methods.engine.sensitivity import Stretches
+from latticebench.methods.engine.starts import smooth
+from latticebench.systems.effects import Effect
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import Library
+from latticebench.systems.samples import Samples
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+# With unknown ends all equations leave the same sites without one, as far as the chain is long enough.
+WIDE, LONG_CHAIN = 2, 9
+# A dense recording is thinned to so many samples in the shortest period, a long one cut to windows of so many samples.
+DENSE, LONG, WINDOWS = 24, 4000, 2
+# A peak of the spectrum is motion where it stands so many times above the noise, and has this share of the largest.
+ABOVE, SHARE = 30.0, 3e-3
+# Outside influences are looked for up to so many times the highest frequency, at so many frequencies at most.
+FARTHER, MOST_FREQUENCIES = 2.5, 400
+# A stretch that lasts so many times as long as its samples ask for holds a gap.
+GAP = 2.0
+# So many sensors are looked at for steps before it is taken that there are none.
+FEW_SENSORS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """The mean power spectrum of all sensors.
+
+    Attributes:
+        omega: angular frequencies.
+        power: relative.
+        peaks: frequencies of the peaks that are motion, the strongest first.
+    """
+
+    omega: Float[ndarray, " frequencies"]
+    power: Float[ndarray, " frequencies"]
+    peaks: Float[ndarray, " peaks"]
+
+    @classmethod
+    def of(cls, samples: Samples) -> Spectrum:
+        """Return the spectrum of a recording; missing and uneven readings are interpolated."""
+        t = samples.t
+        step = float(np.median(np.diff(t)))
+        grid = np.arange(t[0], t[-1] + step / 2, step)
+        size = 4 * len(grid)
+        omega = 2 * np.pi * np.fft.rfftfreq(size, step)
+        total = np.zeros(len(omega))
+        for column in split_parts(samples.u, samples.is_complex).reshape(len(t), -1).T:
+            seen = np.isfinite(column)
+            if np.sum(seen) < 4:
+                continue
+            even = np.interp(grid, t[seen], column[seen])
+            power = np.abs(np.fft.rfft((even - np.mean(even)) * np.hanning(len(even)), size)) ** 2
+            total += power / max(float(np.sum(power)), 1e-300)
+        floor = float(np.median(total[len(total) // 2 :]))
+        inner = (total[1:-1] >= total[:-2]) & (total[1:-1] > total[2:])
+        peaks = np.flatnonzero(inner) + 1
+        tall = peaks[total[peaks] > max(ABOVE * floor, SHARE * float(np.max(total)))]
+        return cls(omega, total, omega[tall[np.argsort(-total[tall])]])
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a search works on.
+
+    Attributes:
+        declared, order: the equation.
+        data: recordings as they are used.
+        chain: their lattice.
+        plain: the declared terms on it.
+        records: readings as real numbers.
+        nodes: smoothed states of each recording (T, S).
+        splines: of the sites without an equation, of each recording; None where every site has one.
+        spectrum: of the longest recording.
+        step: typical time between readings.
+        scene: where effects are placed.
+        candidates: all effects in all places.
+    """
+
+    declared: Library
+    order: int
+    data: tuple[Samples, ...]
+    chain: Chain
+    plain: Dynamics
+    records: tuple[Record, ...]
+    nodes: tuple[Float[ndarray, "time state"], ...]
+    splines: tuple[ndarray | None, ...]
+    spectrum: Spectrum
+    step: float
+    scene: Scene
+    candidates: tuple[Placed, ...]
+
+    @classmethod
+    def of(cls, declared: Library, order: int, data: Sequence[Samples], catalogue: Sequence[Effect]) -> Problem:
+        """Return the problem of finding what an equation lacks of recordings.
+
+        Raises:
+            InputError: the chain is shorter than the stencil.
+        """
+        longest = max(data, key=lambda one: len(one.t))
+        spectrum = Spectrum.of(longest)
+        top = _top(spectrum, longest)
+        data = tuple(part for one in data for part in windows(thinned(one, top)))
+        longest = max(data, key=lambda one: len(one.t))
+        first = data[0]
+        reach = (WIDE, WIDE) if first.ends == "unknown" and first.sites >= LONG_CHAIN else (0, 0)
+        plain = Dynamics(declared.terms, order, first.is_complex, first.sites, first.ends, least_reach=reach)
+        if first.ends == "unknown":
+            plain = replace(plain, least_reach=plain.reach)
+        states = [_states(one, order) for one in data]
+        records, splines = zip(
+            *(_record(one, plain, both) for one, both in zip(data, states, strict=True)), strict=True
+        )
+        widest = max(plain.reach) if first.ends == "unknown" else first.sites - 1
+        levels = records[0].value.shape[1]
+        moving = tuple(range(first.sites)[plain.moving])
+        chain = Chain(first.sites, order, first.is_complex, levels, first.ends, moving, widest)
+        step = float(np.median(np.diff(longest.t)))
+        span = float(longest.t[-1] - longest.t[0])
+        past = tuple(_past(one, field[0], first.is_complex) for one, field in zip(data, states, strict=True))
+        scene = Scene(
+            chain,
+            float(first.t[0]),
+            span,
+            top,
+            _frequencies(top, span, step),
+            past,
+            declared.texts,
+            first.f is not None,
+        )
+        candidates = tuple(one for effect in catalogue for one in way_of(effect).places(effect, scene))
+        nodes = tuple(plain.pack(*both) for both in states)
+        return cls(
+            declared, order, data, chain, plain, records, nodes, splines, spectrum, step, scene, candidates
+        )  # fmt: skip
+
+    def first(self, share: float) -> Problem:
+        """Return the problem of the first share of each recording."""
+        cuts = [max(DEGREE + 1, round(len(one.t) * share)) for one in self.data]
+        data, records, nodes = [], [], []
+        for cut, one, record, states in zip(cuts, self.data, self.records, self.nodes, strict=True):
+            v, f = (None if field is None else field[:cut] for field in (one.v, one.f))
+            data.append(replace(one, t=one.t[:cut], u=one.u[:cut], v=v, f=f))
+            records.append(replace(record, value=record.value[:cut], seen=record.seen[:cut], times=record.times[:cut]))
+            nodes.append(states[:cut])
+        return replace(self, data=tuple(data), records=tuple(records), nodes=tuple(nodes))
+
+    @property
+    def top(self) -> float:
+        """The highest angular frequency that the readings plainly show."""
+        return _top(self.spectrum, max(self.data, key=lambda one: len(one.t)))
+
+    @property
+    def main(self) -> float:
+        """The angular frequency of the strongest peak, at least that of one wave in the recording."""
+        longest = max(self.data, key=lambda one: len(one.t))
+        lowest = 2 * np.pi / float(longest.t[-1] - longest.t[0])
+        return max(float(self.spectrum.peaks[0]), lowest) if len(self.spectrum.peaks) else lowest
+
+    @functools.cached_property
+    def height(self) -> float:
+        """Root mean square of the readings of u."""
+        values = np.concatenate([np.abs(one.u).ravel() for one in self.data])
+        return float(np.sqrt(np.nanmean(values**2)))
+
+    @functools.cached_property
+    def noise(self) -> Float[ndarray, " sensors"]:
+        """The noise of each sensor by the readings alone: u of each site, then v; NaN where they do not tell."""
+        longest = max(self.data, key=lambda one: len(one.t))
+        found = []
+        for field in self._fields(longest):
+            parts = [of_readings(longest.t, part) for part in [field.real, field.imag][: self.chain.parts]]
+            found.append(np.sqrt(np.mean(np.stack(parts) ** 2, axis=0)))
+        return np.concatenate(found)
+
+    @functools.cached_property
+    def steps(self) -> tuple[float, ...]:
+        """The step of each sensor's converter, 0 for none; where the first few have none, the rest have none."""
+        fields = [split_parts(field, self.chain.is_complex) for field in self._fields(self.data[0])]
+        sensors = [field[:, :, site].ravel() for field in fields for site in range(self.chain.sites)]
+        first = [step_of(one) for one in sensors[:FEW_SENSORS]]
+        rest = [step_of(one) for one in sensors[FEW_SENSORS:]] if any(first) else [0.0] * len(sensors[FEW_SENSORS:])
+        return (*first, *rest)
+
+    def _fields(self, samples: Samples) -> list[ndarray]:
+        return [samples.u] if self.chain.levels == 1 or samples.v is None else [samples.u, samples.v]
+
+    @functools.cached_property
+    def _places(self) -> Counter[str]:
+        return Counter(one.effect.name for one in self.candidates)
+
+    def price(self, name: str, numbers: int) -> float:
+        """Return the nats that an effect must bring: noise brings as many in its share of `rules.FALSE_ALARM`."""
+        share = rules.FALSE_ALARM / max(len(self._places), 1) / max(self._places[name], 1)
+        return self.chance(share, numbers) + (rules.STAND_IN if name in rules.STAND_INS else 0.0)
+
+    def chance(self, share: float, numbers: int) -> float:
+        """Return the nats that noise alone reaches with a chance of `share`."""
+        return _isf(share, max(numbers, 1))
+
+    def price_of(self, placed: Placed) -> float:
+        """Return the price of an effect in its place."""
+        return self.price(placed.effect.name, len(placed.numbers)) + self.locked(placed)
+
+    def locked(self, placed: Placed) -> float:
+        """Return what an influence costs besides that swings as the motion itself does."""
+        if placed.effect.name in rules.FED:
+            return rules.LOCKED
+        omega = placed.frequency
+        if omega is None:
+            return 0.0
+        width = 4 * np.pi / float(self.data[0].t[-1] - self.data[0].t[0])
+        own = self.spectrum.peaks[:4]
+        sums = np.abs(
+            np.concatenate([own, 2 * own, np.add.outer(own, own).ravel(), np.subtract.outer(own, own).ravel()])
+        )
+        sums = sums[sums > width]
+        return rules.LOCKED if np.any(np.abs(sums - abs(omega)) < width) else 0.0
+
+
+@functools.lru_cache(maxsize=4096)
+def _isf(share: float, numbers: int) -> float:
+    from scipy import stats
+
+    return float(stats.chi2.isf(share, numbers)) / 2
+
+
+def _top(spectrum: Spectrum, samples: Samples) -> float:
+    lowest = 2 * np.pi / float(samples.t[-1] - samples.t[0])
+    return max(float(np.max(spectrum.peaks, initial=0.0)), lowest)
+
+
+def thinned(samples: Samples, top: float) -> Samples:
+    """Return every k-th sample of one that is read far more often than it moves, and at least `LONG` / 2 of them."""
+    step = float(np.median(np.diff(samples.t)))
+    stride = min(int(2 * np.pi / top / step / DENSE), len(samples.t) // (LONG // 2))
+    if stride < 2 or samples.f is not None:
+        return samples
+    u, v = samples.u[::stride], None if samples.v is None else samples.v[::stride]
+    return replace(samples, t=samples.t[::stride], u=u, v=v)
+
+
+def windows(samples: Samples) -> list[Samples]:
+    """Return evenly spaced windows of a recording that is too long to be used as a whole."""
+    count = len(samples.t)
+    if count <= LONG:
+        return [samples]
+    size = LONG // WINDOWS
+    found = []
+    for begin in np.linspace(0, count - size, WINDOWS).round().astype(int):
+        rows = slice(begin, begin + size)
+        v, f = (None if one is None else one[rows] for one in (samples.v, samples.f))
+        found.append(replace(samples, t=samples.t[rows], u=samples.u[rows], v=v, f=f))
+    return found
+
+
+def _states(samples: Samples, order: int) -> tuple[ndarray, ndarray | None]:
+    """Return smoothed u and, for order 2, v."""
+    if len(samples.t) <= DEGREE:
+        raise InputError(
+            f"{samples.source}: {len(samples.t)} rows are too few for a diagnosis; give at least {DEGREE + 1}"
+        )
+    return smooth(samples, order)
+
+
+def _record(samples: Samples, plain: Dynamics, states: tuple[ndarray, ndarray | None]) -> tuple[Record, ndarray | None]:
+    """Return the readings, and the splines of the sites that have no equation."""
+    fields = [samples.u] if plain.order == 1 or samples.v is None else [samples.u, samples.v]
+    value = np.stack([split_parts(one, samples.is_complex) for one in fields], axis=1)
+    seen = np.isfinite(value)
+    seen[..., plain.border] = False
+    drive, splines = None, None
+    if len(plain.border):
+        from scipy.interpolate import make_interp_spline
+
+        curve = make_interp_spline(samples.t, split_parts(states[0][:, plain.border], samples.is_complex), k=3)
+        drive, splines = BSplines(curve.t, 3), curve.c
+    inputs = None if samples.f is None else samples.forcing()
+    stretches = Stretches(plain, samples.t[:-1], samples.t[1:], inputs, drive, held=True)
+    return Record(stretches, np.where(np.isfinite(value), value, 0.0), seen, samples.t), splines
+
+
+def _past(samples: Samples, u: ndarray, is_complex: bool) -> Factor:
+    from scipy.interpolate import CubicSpline
+
+    curve = CubicSpline(samples.t, split_parts(u, is_complex))
+    begin, end = float(samples.t[0]), float(samples.t[-1])
+
+    def past(t: ndarray) -> ndarray:
+        return np.moveaxis(np.asarray(curve(np.clip(t, begin, end))), 0, 1)
+
+    return past
+
+
+def _frequencies(top: float, span: float, step: float) -> Float[ndarray, " frequencies"]:
+    """Return half a resolution apart, up to a few times the motion's own."""
+    highest = min(0.9 * np.pi / step, FARTHER * top)
+    every = np.arange(1.0, highest * span / np.pi) * np.pi / span
+    return every[:: len(every) // MOST_FREQUENCIES + 1]
+
+
+def turned(problem: Problem, site: int) -> Problem:
+    """Return the problem as it is where the sensor of one site looks from the other side."""
+    sign = np.ones(problem.chain.sites)
+    sign[site] = -1.0
+    own = np.tile(sign[problem.plain.moving], problem.chain.order * problem.chain.parts)
+    return replace(problem, nodes=tuple(nodes * own for nodes in problem.nodes))
+
+
+def regressed(problem: Problem) -> tuple[float, ...]:
+    """Return the declared coefficients that carry the smoothed states over a quarter of the shortest period.
+
+    Each site has a constant force besides, so that a sensor's offset does no harm.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    designs, targets = [], []
+    window = max(1, round(np.pi / 2 / problem.top / problem.step))
+    for record, nodes, splines in zip(problem.records, problem.nodes, problem.splines, strict=True):
+        stretches, dynamics = record.stretches, problem.plain
+        f = None if stretches.inputs is None else stretches.inputs(record.times)
+        driven = stretches.driven(record.times, splines)
+        zero = np.zeros(len(dynamics.terms))
+        values = dynamics.linear(zero, record.times, nodes, f, driven, derivatives=False)[1]
+        curve = make_interp_spline(record.times, np.moveaxis(values, 2, 0), k=min(3, len(record.times) - 1))
+        total = curve.antiderivative()(record.times)
+        rate = nodes.reshape(len(nodes), dynamics.order, dynamics.parts, dynamics.count)[:, -1]
+        # No window holds a gap.
+        whole = record.times[window:] - record.times[:-window] < GAP * window * problem.step
+        flow = np.moveaxis(total[window:] - total[:-window], 2, -1)[whole]
+        flow = flow - np.mean(flow, axis=0)
+        designs.append(flow.reshape(-1, values.shape[1]))
+        gone = (rate[window:] - rate[:-window])[whole]
+        targets.append((gone - np.mean(gone, axis=0)).ravel())
+    design, target = np.concatenate(designs), np.concatenate(targets)
+    size = np.sqrt(np.mean(design**2, axis=0))
+    size[size == 0] = 1.0
+    return tuple(float(one) for one in np.linalg.lstsq(design / size, target, rcond=1e-6)[0] / size)
+
+
+def derivative_share(problem: Problem, motion: Sequence[ndarray], right: Sequence[ndarray]) -> float:
+    """Return the share of the highest time derivative, along smoothed readings, that right-hand sides leave.
+
+    Args:
+        problem: the recordings.
+        motion: readings of u, or of v where they are to be differentiated once, as a motion (T, parts, M).
+        right: the right-hand side at the smoothed states of each recording (T, parts, M).
+    """
+    left, size = 0.0, 0.0
+    twice = problem.order == 2 and problem.chain.levels == 1
+    for samples, field, value in zip(problem.data, motion, right, strict=True):
+        found = [differentiate(samples.t, field[:, part], "smoothing-spline") for part in range(field.shape[1])]
+        rate = np.stack([one.second if twice else one.first for one in found], axis=1)
+        left, size = left + float(np.nansum((rate - value) ** 2)), size + float(np.nansum(rate**2))
+    return float(np.sqrt(left / size)) if size > 0 else float("nan")

@@ -1,0 +1,41 @@
+"""The numbers that decide what a diagnosis says.
+
+Evidence is in nats: natural logarithms of likelihood ratios. `results/loop/rules.md` shows what each number buys.
+"""
+
+# Chance that a diagnosis of a recording that lacks nothing names an effect, over all candidates together. Each effect
+# of the catalogue has an equal share of it, divided among the places and frequencies where it may be.
+FALSE_ALARM = 0.005
+# Chance that such a diagnosis finds something without a name.
+FALSE_DOUBT = 0.005
+# Nats that an effect must bring besides if it is a stand-in for many others: a priori it is less often what is missing.
+STAND_IN = 5.0
+STAND_INS = frozenset({
+    "gradient", "trap", "asymmetric-coupling", "memory", "parametric-drive", "kick", "sensor-curve", "long-range",
+    "disorder", "clock", "onsite-quintic", "gain-loss",
+})  # fmt: skip
+# Nats besides for an influence that swings at a frequency, or twice or half one, of the motion itself: a wrong equation
+# leaves just that.
+LOCKED = 30.0
+# Effects that feed readings back into the motion: what they bring is such an influence, too.
+FED = frozenset({"memory"})
+# Models that are carried to the next horizon, and how many nats they may be behind the best one.
+RIVALS, BEHIND = 3, 60.0
+# Candidates of each model that are fitted in full, those of the highest score first.
+TRIED = 4
+# Effects in a model, at most.
+MOST_EFFECTS = 8
+# Effects that come within so many nats of the one that is named cannot be told from it by these readings.
+EQUAL = 3.0
+# Influences with a frequency or a time of their own are looked for on horizons of so many periods of the main
+# frequency: on shorter ones they stand in for whatever is missing.
+PERIODS = 3.0
+# Horizons begin at this share of the shortest period, where a wrong equation can follow, too.
+FIRST_HORIZON = 0.5
+# A residual beyond so many times the noise that the readings themselves show is not followed.
+LOST = 3.0
+# Nats that a chain costs in which neighbours push each other away. In a linear chain of two it is the mirror image of
+# one whose second sensor looks from the other side; of the two, that is what laboratories have.
+REPELLING = 30.0
+# A forecast is worse where its error grows by more than this share of itself.
+WORSE = 0.05

@@ -1,0 +1,145 @@
+"""Following a model: gaps are closed to the true motion, readings are undone, and the noise of each sensor is found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from latticebench.diagnosis.fitting import fit
+from latticebench.diagnosis.horizon import Layout, follow, unread
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.noise import Structure
+from latticebench.diagnosis.problem import LONG, WINDOWS, Problem, regressed, thinned, windows
+from latticebench.systems.effects import CATALOGUE
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+
+SITES = 4
+DECLARED, TRUTH = library("chain", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])"), (2.0, -3.0)
+
+
+def rate(_, y):
+    u, v = np.split(y, 2)
+    beside = np.concatenate([u[1:], u[-1:]]) + np.concatenate([u[:1], u[:-1]])
+    return np.concatenate([v, 2.0 * (beside - 2 * u) - 3.0 * np.sin(u)])
+
+
+def motion(t):
+    start = np.concatenate([0.7 * np.cos(2 * np.arange(SITES)), np.zeros(SITES)])
+    return solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-12, atol=1e-13).y.T
+
+
+def recording(t, noise=0.01, seed=0, *, velocities=True):
+    """Positions with noise, in which a size may be given for each sensor, and velocities."""
+    y = motion(t)
+    y = y + noise * np.random.default_rng(seed).normal(size=y.shape)
+    return Samples(t, y[:, :SITES], y[:, SITES:] if velocities else None, source="chain", ends="free")
+
+
+def followed(problem, layout, model, small=1e-9):
+    """The motion from near the smoothed readings, and then more and more exactly."""
+    states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
+    for size in (1e-3, small):
+        finer = replace(layout, small=size).with_substeps(model, states, problem.top)
+        path = follow(model, finer, states)
+        if path is None:
+            return None
+        states = path.nodes
+    return path
+
+
+EVEN = np.linspace(0, 20, 400)
+UNEVEN = np.sort(np.random.default_rng(3).uniform(0, 20, 400))
+
+
+@pytest.mark.parametrize("t", [EVEN, UNEVEN, EVEN[::4]], ids=["even", "uneven", "sparse"])
+def test_closing_the_gaps_gives_the_motion_that_an_integrator_gives(t):
+    problem = Problem.of(DECLARED, 2, [recording(t, 0.003)], CATALOGUE)
+    layout = Layout.of(problem, len(t), None, 1e-5)
+    path = followed(problem, layout, Model(DECLARED, 2, TRUTH))
+    found = path.nodes[0][0]
+    exact = solve_ivp(rate, t[[0, -1]], found[0], t_eval=t, method="DOP853", rtol=1e-12, atol=1e-13).y.T
+    np.testing.assert_allclose(found, exact, atol=1e-6)
+
+
+@pytest.mark.parametrize("length", [7, 50, 399])
+def test_pieces_have_every_row_once_and_each_follows_from_its_own_start(length):
+    problem = Problem.of(DECLARED, 2, [recording(EVEN)], CATALOGUE)
+    layout = Layout.of(problem, length, None, 1e-5)
+    rows, valid = layout.rows[0], layout.valid[0]
+    assert sorted(rows[valid]) == list(range(len(EVEN)))
+    path = followed(problem, layout, Model(DECLARED, 2, TRUTH))
+    for piece, own, seen in zip(path.nodes[0][::20], rows[::20], valid[::20], strict=True):
+        t = EVEN[own[seen]]
+        exact = solve_ivp(rate, t[[0, -1]], piece[0], t_eval=t, rtol=1e-10, atol=1e-11).y.T
+        np.testing.assert_allclose(piece[seen], exact, atol=1e-6)
+
+
+def test_a_model_that_runs_away_is_not_followed():
+    problem = Problem.of(DECLARED, 2, [recording(EVEN)], CATALOGUE)
+    layout = Layout.of(problem, len(EVEN), None, 1e-4)
+    assert followed(problem, layout, Model(DECLARED, 2, (-300.0, 200.0))) is None
+
+
+@pytest.mark.parametrize("name", ["sensor-offset", "sensor-gain", "sensor-curve"])
+@pytest.mark.parametrize("velocities", [False, True])
+def test_unread_undoes_what_instruments_do(name, velocities):
+    problem = Problem.of(DECLARED, 2, [recording(EVEN, 0.0, velocities=velocities)], CATALOGUE)
+    layout = Layout.of(problem, len(EVEN), None, 1e-4)
+    for placed in (one for one in problem.candidates if one.effect.name == name):
+        strong = placed.moved(np.full(len(placed.strength), 0.15))
+        model = Model(DECLARED, 2, TRUTH, (strong,))
+        field = motion(EVEN).reshape(len(EVEN), 2, 1, SITES)
+        levels = field[:, : problem.chain.levels]
+        rates = np.zeros_like(levels)
+        rates[:, 0] = field[:, 1]
+        reading = field.copy()
+        reading[:, : problem.chain.levels] += strong.misread(EVEN, levels, rates).added
+        found = unread(model, layout, 0, reading.reshape(len(EVEN), -1))
+        seen = found.reshape(field.shape)[:, : problem.chain.levels]
+        np.testing.assert_allclose(seen, levels, atol=1e-3)
+
+
+def test_without_instruments_there_is_nothing_to_undo():
+    problem = Problem.of(DECLARED, 2, [recording(EVEN)], CATALOGUE)
+    layout = Layout.of(problem, len(EVEN), None, 1e-4)
+    assert unread(Model(DECLARED, 2, TRUTH), layout, 0, problem.nodes[0]) is problem.nodes[0]
+
+
+def test_a_fit_finds_coefficients_and_the_noise_of_each_sensor():
+    sizes = np.concatenate([[0.002, 0.02, 0.005, 0.01], [0.03, 0.03, 0.01, 0.01]])
+    problem = Problem.of(DECLARED, 2, [recording(EVEN, sizes)], CATALOGUE)
+    layout = Layout.of(problem, len(EVEN), None, 1e-4)
+    states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
+    found = fit(Model(DECLARED, 2, regressed(problem)), layout, states, structure=Structure(own_sizes=True))
+    assert found.converged
+    np.testing.assert_allclose(found.noise.deviation(), sizes, rtol=0.15)
+    np.testing.assert_allclose(found.rms, sizes, rtol=0.15)
+    assert np.max(np.abs((found.model.numbers - TRUTH) / found.stderr)) < 4
+    assert np.max(found.stderr) < 0.01
+    (curve,) = found.curves()
+    np.testing.assert_allclose(curve.field[:, :, 0].reshape(len(EVEN), -1), motion(EVEN), atol=0.02)
+
+
+def test_the_declared_coefficients_to_start_from_are_near_those_that_made_the_data_whatever_the_sensors_zero():
+    data = recording(EVEN, 0.003)
+    for offset in (0.0, 0.5):
+        shifted = replace(data, u=data.u + offset * np.eye(SITES)[2])
+        linear = library("linear", "u[n+1]+u[n-1]-2*u[n]; u[n]")
+        found = regressed(Problem.of(linear, 2, [shifted], CATALOGUE))
+        np.testing.assert_allclose(found, [2.0, -2.8], rtol=0.1)
+
+
+def test_a_long_recording_is_used_thinned_and_in_windows():
+    t = np.linspace(0, 4000, 200_000)
+    samples = Samples(t, np.sin(t)[:, None], source="long", ends="free")
+    thin = thinned(samples, 1.0)
+    assert len(thin.t) < len(t)
+    assert np.all(np.isin(thin.t, t))
+    parts = windows(thin)
+    assert len(parts) == WINDOWS
+    assert sum(len(one.t) for one in parts) <= LONG
+    assert (parts[0].t[0], parts[-1].t[-1]) == (thin.t[0], thin.t[-1])
