@@ -14,8 +14,11 @@ from latticebench.systems.files import write_text
 
 TABLES = ("measured",)
 FIGURES: tuple[str, ...] = ()
-# Entries of a ranking that the page shows.
+# Candidates that the page shows.
 SHOWN = 6
+ERRORS = {
+    "residual": "residual over the noise", "rms": "residual in the readings' units", "forecast": "forecast",
+}  # fmt: skip
 
 
 def table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
@@ -112,12 +115,22 @@ def _recording(result: Mapping[str, Any]) -> list[str]:
         )
         alike = f"; cannot be told from {', '.join(effect['indistinguishable'])}" if effect["indistinguishable"] else ""
         text.append(f"- {effect['effect']}: {values}{alike}")
+    text += ["", *(f"Noise: {line}." for line in report["noise_lines"])]
     error = report["error"]
     text += ["", "| | before | after |", "|---|---|---|"]
-    for name in ("residual", "forecast"):
-        text.append(f"| {name} | {format_number(error[name]['before'])} | {format_number(error[name]['after'])} |")
-    text += ["", "What was tried in each round, the best first (evidence in natural logarithms):", ""]
-    for number, one in enumerate(report["rounds"], start=1):
-        listed = ", ".join(f"{entry['effect']} {entry['evidence']:.0f}" for entry in one["ranking"][:SHOWN])
-        text.append(f"{number}. {listed}")
+    for name, title in ERRORS.items():
+        text.append(f"| {title} | {format_number(error[name]['before'])} | {format_number(error[name]['after'])} |")
+    text += ["", "How the search went: the best model on each horizon, and how far the next one was behind (nats):", ""]
+    for one in report["horizons"]:
+        best, *others = one["models"]
+        behind = f"; {_named(others[0])} {others[0]['behind']:.1f} behind" if others else ""
+        text.append(f"- {one['samples']} samples, {one['periods']:.2g} periods: {_named(best)}{behind}")
+    tried = report["horizons"][-1]["tried"] if report["horizons"] else []
+    listed = ", ".join(f"{one['effect']} {one['gain']:.1f} ({one['price']:.1f})" for one in tried[:SHOWN])
+    text += ["", f"Candidates beside the last model, with what they gain and what they cost (nats): {listed}."]
     return [*text, ""]
+
+
+def _named(model: Mapping[str, Any]) -> str:
+    """Return the effects of a model in one text."""
+    return " + ".join(model["effects"]) or "as declared"

@@ -24,12 +24,11 @@ FIGURES = ("confusion",)
 SETTINGS = ("system", "effect", "z", "noise", "velocities", "seed")
 COLUMNS = (
     *SETTINGS, "status", "size", "apart", "verdict", "named", "alike", "right", "extra",
-    "residual_before", "residual_after", "forecast_before", "forecast_after", "forecast_true",
+    "residual_before", "residual_after", "forecast_before", "forecast_after",
     "coefficients_before", "coefficients_after", "seconds", "cpu_seconds", "message",
 )  # fmt: skip
 # What no single effect of the catalogue can do is visible from this size on, in units of its standard error.
 APART = 5.0
-TRUE_TIMES = 1.5
 
 
 def group_of(effect: str, apart: float) -> str:
@@ -84,21 +83,8 @@ def _line(head: dict[str, Any], group: pd.DataFrame) -> dict[str, Any]:
     )}  # fmt: skip
     return {
         **head, "trials": len(group), "right": float(group["right"].astype(float).mean()),
-        "effects too many": float((group["extra"].astype(float) > 0).mean()), **values, **_ahead(group),
+        "effects too many": float((group["extra"].astype(float) > 0).mean()), **values,
     }  # fmt: skip
-
-
-def _ahead(group: pd.DataFrame) -> dict[str, float]:
-    """Compare forecasts with those of the true model fitted to the same data.
-
-    Returns:
-        the median of the ratio, and the share of ratios that are at most TRUE_TIMES.
-    """
-    ratio = (group["forecast_after"].astype(float) / group["forecast_true"].astype(float)).dropna()
-    return {
-        "forecast over that of the true model": float(ratio.median()) if len(ratio) else float("nan"),
-        f"at most {TRUE_TIMES:g} times that": float((ratio <= TRUE_TIMES).mean()) if len(ratio) else float("nan"),
-    }
 
 
 def by_effect(frame: pd.DataFrame) -> pd.DataFrame:

@@ -14,23 +14,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.bench.trials.faults import FAULTS, MISREADINGS, NONE, OTHERS, PUSHES, ROUNDED, Fault, push
+from latticebench.bench.trials.faults import FAULTS, MISREADINGS, NONE, OTHERS, PUSHES, Fault, push
 from latticebench.bench.trials.faults.setting import Fields, Setting, draw_circumstances, other
-from latticebench.diagnosis.catalogued import candidates_of
-from latticebench.diagnosis.model import Fitted, Model, refit
-from latticebench.diagnosis.placed import rounding_error
-from latticebench.diagnosis.tangent import Tangent, linearise
-from latticebench.methods.engine.shooting import Solution, State
+from latticebench.bench.trials.sight import Sight
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import System
-from latticebench.systems.motion import Motion, motion
+from latticebench.systems.motion import motion
 from latticebench.systems.samples import Samples, SimulatedSamples
 from latticebench.systems.simulate import noise_size, sample_times
 from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
     from numpy import ndarray
 
 # Steps to the amount of an effect that has the size: to first order, then with the declared equation fitted, to within
@@ -114,8 +109,6 @@ def make(system: System, name: str, z: float, draw: np.random.Generator, conditi
     added = _add(system, names, z, draw, setting, plain, sizes) if names else _Added(plain, 0.0, 0.0, 0.0)
     u, v = added.fields
     noisy = u + _noise(u, sizes[0], draw)
-    if name == ROUNDED:
-        noisy = rounded(noisy, float(np.real(added.amount)))
     noisy_v = v + _noise(v, sizes[1], draw) if v is not None and conditions.velocities else None
     clean = Samples(times, u, v, drawn.force, source="exact")
     observed = SimulatedSamples(
@@ -182,7 +175,7 @@ def _add(
         plain: its clean readings without them.
         sizes: standard deviations of the noise on u and, where it is read, on v.
     """
-    sight = _sight(system, plain, setting.times, sizes, setting.chain)
+    sight = Sight.of(system, plain, setting.times, sizes, setting.chain)
     scale = float(np.sqrt(np.mean(np.abs(plain[0]) ** 2)))
     amounts: dict[str, complex] = {}
     for one in names:
@@ -194,16 +187,13 @@ def _add(
         def readings(amount: complex, fault: Fault = fault) -> Fields:
             return fault.fields(setting, amount)
 
-        if one == ROUNDED:
-            amounts[one] = _step_of_size(plain[0], sizes[0], z)
-        else:
-            amounts[one] = _sized(readings, sight, z, direction, scale) if fault.sized else 1.0
+        amounts[one] = _sized(readings, sight, z, direction, scale) if fault.sized else 1.0
         fields = readings(amounts[one])
-        size = z if one == ROUNDED else sight.fitted_size(fields)
-        apart = sight.apart(fields) if one in OTHERS else 0.0
+        line = sight.fitted(fields)
+        apart = sight.apart(line) if one in OTHERS else 0.0
     if len(names) > 1:
         fields = _together(setting, amounts)
-    return _Added(fields, amounts[names[0]], size, apart)
+    return _Added(fields, amounts[names[0]], line.size, apart)
 
 
 def _together(setting: Setting, amounts: Mapping[str, complex]) -> Fields:
@@ -214,7 +204,7 @@ def _together(setting: Setting, amounts: Mapping[str, complex]) -> Fields:
     return FAULTS[misread[0]].fields(pushed, amounts[misread[0]]) if misread else pushed.run()
 
 
-def _sized(readings: Callable[[complex], Fields], sight: _Sight, z: float, direction: complex, scale: float) -> complex:
+def _sized(readings: Callable[[complex], Fields], sight: Sight, z: float, direction: complex, scale: float) -> complex:
     """Return the amount that is visible with the size z.
 
     Raises:
@@ -231,37 +221,11 @@ def _sized(readings: Callable[[complex], Fields], sight: _Sight, z: float, direc
         amount *= float(np.clip(z / size, 0.2, 1e5))
     # A large effect may be absorbed by the declared equation's own coefficients, or by a motion of another kind.
     for _ in range(REFITS):
-        size = sight.fitted_size(readings(amount * direction))
+        size = sight.fitted(readings(amount * direction)).size
         if abs(size / z - 1) < CLOSE:
             break
         amount *= float(np.clip((z / max(size, 1e-12)) ** 0.8, 0.3, 3.0))
     return amount * direction
-
-
-def rounded(field: ndarray, step: float) -> ndarray:
-    """Return a field with each part rounded to multiples of a step."""
-    if np.iscomplexobj(field):
-        return np.asarray(rounded(field.real, step) + 1j * rounded(field.imag, step))
-    return np.asarray(np.round(field / step) * step)
-
-
-def _step_of_size(u: ndarray, sigma: float, z: float) -> float:
-    """Return the step whose mean rounding error has the size z beside noise and rounding together.
-
-    Raises:
-        InputError: there is none; n readings tell less than the root of n.
-    """
-    parts = np.stack([u.real, u.imag]) if np.iscomplexobj(u) else u[None]
-
-    def size(step: float) -> float:
-        wrong = rounding_error(parts, step, sigma, 0.0)
-        return float(np.sqrt(np.sum(wrong**2) / (sigma**2 + step**2 / 12)))
-
-    steps = sigma * np.geomspace(1, 300, 200)
-    for step in steps:
-        if size(float(step)) >= z:
-            return float(step)
-    raise InputError(f"no rounding of so few readings has the size {z:g}")
 
 
 def _noise(field: ndarray, sigma: float, draw: np.random.Generator) -> ndarray:
@@ -269,77 +233,3 @@ def _noise(field: ndarray, sigma: float, draw: np.random.Generator) -> ndarray:
     if np.iscomplexobj(field):
         return np.asarray(sigma * (draw.normal(size=field.shape) + 1j * draw.normal(size=field.shape)))
     return np.asarray(sigma * draw.normal(size=field.shape))
-
-
-@dataclass(frozen=True, eq=False)
-class _Sight:
-    """What can be seen of an effect on the readings beside the declared equation's unknowns, to first order.
-
-    Attributes:
-        plain: the clean readings without the effect.
-        tangent: of the declared equation at its true coefficients.
-        chain: the chain.
-        levels: 1 where only u is read, else 2.
-    """
-
-    plain: Fields
-    tangent: Tangent
-    chain: Motion
-    levels: int
-
-    def left(self, found: Fields) -> Float[ndarray, " rows"]:
-        """Return the effect on readings in units of the noise, less what the declared equation's unknowns can do."""
-        differences = [
-            one - exact for one, exact in zip(found, self.plain, strict=True) if one is not None and exact is not None
-        ]
-        parts = [
-            np.stack([f.real, f.imag] if self.chain.is_complex else [f], axis=1) for f in differences[: self.levels]
-        ]
-        path = self.tangent.paths[0]
-        return self.tangent.new(path.free(path.rows(np.stack(parts, axis=1)[None])))[:, 0]
-
-    def size(self, found: Fields) -> float:
-        """Return the length of that: a small effect's size over the smallest standard error it could be known with."""
-        return float(np.linalg.norm(self.left(found)))
-
-    def refitted(self, found: Fields) -> Fitted:
-        """Return the fit of the declared equation to clean readings."""
-        u, v = found
-        fitted = self.tangent.fitted
-        clean = replace(fitted.data[0], u=u, v=v if self.levels > 1 else None)
-        again = refit(fitted.model, [clean], fitted.solution.state)
-        return replace(again, solution=replace(again.solution, sigma=fitted.sigma))
-
-    def fitted_size(self, found: Fields) -> float:
-        """Return the size of an effect that need not be small: what the declared equation, fitted, leaves."""
-        fitted = self.refitted(found)
-        return float(np.linalg.norm(fitted.residuals()[0] / fitted.sigma[:, None, None]))
-
-    def apart(self, found: Fields) -> float:
-        """Return what the nearest single effect of the catalogue, of any amount, leaves of that.
-
-        Effects with a coefficient for every site or time come near anything and are not counted.
-        """
-        tangent = linearise(self.refitted(found))
-        left, near = tangent.residual, 0.0
-        for effect in CATALOGUE:
-            for one in candidates_of(tangent, effect):
-                if one.spread is None:
-                    near = max(near, float(np.sum((one.basis.T @ left) ** 2)))
-        return float(np.sqrt(max(left @ left - near, 0.0)))
-
-
-def _sight(system: System, plain: Fields, times: ndarray, sizes: list[float], chain: Motion) -> _Sight:
-    """Return the declared equation linearised about the motion without an effect."""
-    declared = system.library("equation")
-    truth = system.truth(declared, {})
-    assert truth is not None
-    u, v = plain
-    samples = Samples(times, u, v if len(sizes) > 1 else None, ends=system.ends)
-    model = Model(declared, system.order)
-    records = model.records([samples])
-    nodes = records[0].stretches.dynamics.pack(u, v)
-    sigma = np.array(sizes)
-    covariance, counts = np.eye(len(truth)), np.ones(len(sizes))
-    solution = Solution(State(truth, (nodes,), (None,)), sigma, covariance, sigma**2, counts, 1, True, ())
-    return _Sight(plain, linearise(Fitted(model, (samples,), tuple(records), solution)), chain, len(sizes))

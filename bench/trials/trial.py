@@ -11,21 +11,15 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pydantic
-from threadpoolctl import threadpool_limits
 
 from latticebench import systems
 from latticebench.bench.axes import Listed, Seeds
 from latticebench.bench.case import Case, Folders, Number, Roots, Settings
 from latticebench.bench.trials import faults, specimen
 from latticebench.bench.trials.specimen import Conditions, Specimen
-from latticebench.diagnosis.catalogued import candidates_of
-from latticebench.diagnosis.placed import PlacedEffect
-from latticebench.diagnosis.polish import polish
 from latticebench.diagnosis.repair import Diagnosis, diagnose
-from latticebench.diagnosis.residual import alike, pooled, predict
-from latticebench.diagnosis.tangent import linearise
 from latticebench.methods.method import Skipped
-from latticebench.systems.effects import CATALOGUE, find
+from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import System
 
@@ -82,7 +76,7 @@ class Trial(Case):
             "size": None, "apart": None, "about": None, "verdict": None, "named": None, "alike": None, "right": None,
             "extra": None, "noise_found": None, "noise_true": None, "residual_before": None, "residual_after": None,
             "forecast_before": None, "forecast_after": None, "coefficients_before": None, "coefficients_after": None,
-            "forecast_true": None, "seconds": None, "cpu_seconds": None,
+            "seconds": None, "cpu_seconds": None,
         }  # fmt: skip
 
     def run(self, folders: Folders, found: dict[str, Any]) -> None:
@@ -92,20 +86,17 @@ class Trial(Case):
         one = self.recording(system)
         wall, cpu = time.perf_counter(), time.process_time()
         data = [replace(one.samples, ends=system.ends)]
-        diagnosis = diagnose(declared, system.order, data, CATALOGUE, self.seed).against(system.truth(declared, {}))
+        diagnosis = diagnose(declared, system.order, data, CATALOGUE).against(system.truth(declared, {}))
         found.update(seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
         found.update(size=one.z, apart=one.apart, about=dict(one.about), **_errors(diagnosis, one.samples.sigma))
-        course = diagnosis.course
-        named = [change.effect.name for change in course.after.model.effects]
-        alike = [list(names) for names in course.equal]
+        named = [one.name for one in diagnosis.findings]
+        alike = [list(one.alternatives) for one in diagnosis.findings]
         wanted = wanted_names(self.effect)
         found.update(
-            verdict=course.verdict, named=named, alike=alike,
-            right=is_right(self.effect, named, alike, course.verdict),
+            verdict=diagnosis.verdict, named=named, alike=alike,
+            right=is_right(self.effect, named, alike, diagnosis.verdict),
             extra=max(len(named) - max(len(wanted), 1), 0) if wanted else len(named),
         )  # fmt: skip
-        if self.effect in KNOWN:
-            found["forecast_true"] = _forecast_of_truth(one, diagnosis)
 
     def recording(self, system: System) -> Specimen:
         """Make the recording.
@@ -186,31 +177,6 @@ def wanted_names(effect: str) -> list[str]:
     return [] if effect == faults.NONE or effect in faults.OTHERS else effect.split("+")
 
 
-def _forecast_of_truth(one: Specimen, found: Diagnosis) -> float | None:
-    """Return the error of forecasts by the true model, fitted to the same data; None where it cannot be set up.
-
-    Its effect is put at the place and with the frequency, delay and so on that it was made with; these and its
-    coefficients are then fitted.
-    """
-    course = found.course
-    before = alike(course.before, course.after)
-    near = [way.placed for way in candidates_of(linearise(before), find(one.effect)) if not way.placed.as_force]
-    if not near:
-        return None
-
-    def distance(change: PlacedEffect) -> tuple[Any, ...]:
-        away = sum(abs(value - one.about[name]) for name, value in change.psi.items() if name in one.about)
-        place = change.site not in (None, int(one.about["site"]))
-        # What was made has faults of u and v alike, jitter rather than a slow clock, and these other ends.
-        return place, change.site is None, change.ends != one.ends, not change.both, away, -len(change.psi)
-
-    chosen = min(near, key=distance)
-    true = chosen.moved({name: float(one.about[name]) for name in chosen.psi if name in one.about})
-    with threadpool_limits(1):
-        fitted = polish(before.model.with_effect(true), before)
-        return None if fitted is None else pooled(predict(fitted))
-
-
 def is_right(effect: str, named: list[str], alike: list[list[str]], verdict: str) -> bool:
     """Return whether the effect was named first or in the first group, of at most two; two effects in either order.
 
@@ -231,9 +197,11 @@ def is_right(effect: str, named: list[str], alike: list[list[str]], verdict: str
 
 
 def _errors(found: Diagnosis, sigma: float | None) -> dict[str, Any]:
-    parts = np.sqrt(2) if found.course.after.data[0].is_complex else 1.0
+    """Return the errors before and after; the noise is that of u, of a complex field that of both parts together."""
+    first = found.data[0]
+    parts = np.sqrt(2) if first.is_complex else 1.0
     return {
-        "noise_found": float(found.noise[0] * parts), "noise_true": sigma,
+        "noise_found": float(parts * np.sqrt(np.nanmean(found.noise[: first.sites] ** 2))), "noise_true": sigma,
         "residual_before": found.residual[0], "residual_after": found.residual[1],
         "forecast_before": found.forecast[0], "forecast_after": found.forecast[1],
         "coefficients_before": None if found.coefficients is None else found.coefficients[0],

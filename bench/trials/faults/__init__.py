@@ -21,8 +21,6 @@ from latticebench.systems.lattice import System
 from latticebench.systems.terms import Term, express
 
 NONE = "none"
-# Put on after the noise, as what is rounded is the noisy reading.
-ROUNDED = "quantisation"
 
 
 @dataclass(frozen=True)
@@ -86,12 +84,12 @@ MISREADINGS = {
     "sensor-offset": _misread(instrument.offset),
     "sensor-gain": _misread(instrument.gain),
     "sensor-curve": _misread(instrument.curve),
-    "clock": _misread(instrument.jitter),
+    # Where only u is read, another unit of time does the same.
+    "clock": replace(_misread(instrument.slow_clock), only="second order"),
 }
 CATALOGUED = {
     **_pushing(pushes.CATALOGUED),
     **MISREADINGS,
-    ROUNDED: Fault(lambda setting, _: setting.run(), real=True, sized=False),
     "ends": Fault(unseen.ends, real=True, sized=False),
     "unequal-masses": Fault(unseen.unequal_masses, real=True),
     "known-input": Fault(unseen.known_input),
@@ -145,7 +143,8 @@ FIFTH_BLIND = {
     "other: mixer-imbalance": replace(_misread(instrument.unbalanced), only="complex"),
     "other: resampled-rows": _misread(instrument.resampled),
 }
-OTHERS = {**_pushing(pushes.PLAIN), **BLIND, **SECOND_BLIND, **THIRD_BLIND, **FOURTH_BLIND, **FIFTH_BLIND}
+PLAIN = {**_pushing(pushes.PLAIN), "other: jittered-rows": _misread(instrument.jitter)}
+OTHERS = {**PLAIN, **BLIND, **SECOND_BLIND, **THIRD_BLIND, **FOURTH_BLIND, **FIFTH_BLIND}
 FAULTS = {**CATALOGUED, **OTHERS}
 
 
@@ -155,9 +154,9 @@ def sensible(name: str, system: System) -> bool:
         return OTHERS[name].fits(system)
     effect = find(name)
     texts = effect.texts(system.order, system.is_complex)
-    if not texts or (name == "known-input" and system.is_complex):
+    if not texts or not FAULTS[name].fits(system) or (name == "known-input" and system.is_complex):
         return False
-    if effect.acts != "everywhere":
+    if not effect.is_a_term:
         return True
     declared = system.library("equation").terms
     return any(express(Term(text), declared, system.is_complex) is None for text in texts)
@@ -172,7 +171,6 @@ __all__ = [
     "NONE",
     "OTHERS",
     "PUSHES",
-    "ROUNDED",
     "SECOND_BLIND",
     "THIRD_BLIND",
     "Fault",

@@ -38,10 +38,15 @@ def curve(setting: Setting, size: float) -> Fields:
     return bent, None if v is None else v * (1 + 2 * size * u)
 
 
+def slow_clock(setting: Setting, size: float) -> Fields:
+    """Read each row late by a share of the time since the first."""
+    begin = setting.times[0]
+    return setting.at(begin + (1 + size) * (setting.times - begin)).run()
+
+
 def jitter(setting: Setting, size: float) -> Fields:
     """Read each row a little late or early, within the record."""
     times, drawn = setting.times, setting.drawn
-    assert drawn.late is not None
     at = np.clip(times + size * drawn.late, times[0], times[-1])
     grid, place = np.unique(np.concatenate([times[[0, -1]], at]), return_inverse=True)
     u, v = setting.at(grid).run()

@@ -52,7 +52,7 @@ class Drawn:
         shape: wave numbers and phases of a drawn function (2, 3).
         each: a number for each site (N,).
         omegas, phases: of five waves at each site (5, N).
-        late: how late each row is read, in units of the jitter (T,), or None.
+        late: how late each row is read, in units of the jitter (T,).
         force: a measured input (T, N), or None.
         near: how much each site feels of each (N, N).
         pickup: how much hum each sensor's wires catch (N,).
@@ -72,7 +72,7 @@ class Drawn:
     each: Float[ndarray, " sites"]
     omegas: Float[ndarray, "waves sites"]
     phases: Float[ndarray, "waves sites"]
-    late: Float[ndarray, " time"] | None
+    late: Float[ndarray, " time"]
     force: Float[ndarray, "time sites"] | None
     near: Float[ndarray, "sites sites"]
     pickup: Float[ndarray, " sites"]
@@ -216,7 +216,6 @@ def _first_numbers(
     }
     each = draw.normal(size=sites)
     about["delay"] = span * draw.uniform(0.08, 0.2)
-    late = draw.normal(size=len(times)) if "clock" in name.split("+") else None
     force = None
     if name == "known-input":
         force = np.cumsum(draw.normal(size=(len(times), sites)), axis=0)
@@ -228,7 +227,7 @@ def _first_numbers(
     shape = np.stack([draw.uniform(1.0, 5.0, size=3), draw.uniform(0, 2 * np.pi, size=3)])
     return about, {
         "n": n, "far": far - np.diag(far.sum(axis=1)), "bond": bond, "bonds": bonds, "shape": shape, "each": each,
-        "omegas": omegas, "phases": phases, "late": late, "force": force,
+        "omegas": omegas, "phases": phases, "force": force,
     }  # fmt: skip
 
 
@@ -271,5 +270,5 @@ def _more_numbers(about: dict[str, float], sites: int, times: ndarray, more: np.
     wander = np.append(0.0, np.cumsum(more.normal(size=len(times) - 1))) / np.sqrt(len(times))
     return {
         "near": near, "pickup": pickup, "supply": supply, "flicker": flicker, "spikes": spikes, "switches": switches,
-        "wander": wander,
+        "wander": wander, "late": more.normal(size=len(times)),
     }  # fmt: skip

@@ -10,9 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from latticebench import systems
 from latticebench.bench import kinds
-from latticebench.bench.case import Folders
 from latticebench.bench.compare import compare, read_run
 from latticebench.bench.report.schema import json_schema
 from latticebench.bench.run import run
@@ -20,9 +18,7 @@ from latticebench.bench.store import create, open_store
 from latticebench.bench.suite import Suite, load
 from latticebench.bench.trials import scores
 from latticebench.bench.trials.faults import SECOND_BLIND
-from latticebench.bench.trials.specimen import Conditions, make
 from latticebench.bench.trials.trial import Trial, is_right
-from latticebench.bench.worker import attempt
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError
 
@@ -132,7 +128,8 @@ def test_one_suite_of_all_kinds_is_run_resumed_and_published(tmp_path: Path) -> 
     report = json.loads((tmp_path / "out" / "measured" / "swing.json").read_text())
     jsonschema.validate(report, json.loads(json_schema("diagnosis")))
     assert {"command": "", **results[4]["made"], "seeds": []} == report.pop("provenance")
-    assert {"schema": report.pop("schema"), **report} == {"schema": "latticebench/diagnosis/1", **results[4]["report"]}
+    assert report.pop("schema").startswith("latticebench/diagnosis/")
+    assert report == results[4]["report"]
 
 
 def test_a_recording_that_changed_is_diagnosed_again(tmp_path: Path) -> None:
@@ -193,19 +190,3 @@ def test_a_suite_may_ask_for_one_blind_set(tmp_path: Path) -> None:
     path.write_text('title = "x"\n[[made]]\neffects = ["second-blind"]\nsystems = ["phi4", "dnls"]\nz = [30]\n')
     asked = {trial.effect for trial in trials_of(load(str(path)))}
     assert asked == set(SECOND_BLIND)
-
-
-@pytest.mark.parametrize("effect", ["drive", "sensor-gain", "ends", "unequal-masses"])
-def test_where_the_right_effect_is_named_forecasts_are_those_of_the_true_model(effect: str) -> None:
-    row = attempt(Trial(system="phi4", effect=effect, z=30.0, sites=9, samples=30), Folders())
-    assert row["named"] == [effect]
-    assert row["forecast_after"] == pytest.approx(row["forecast_true"], rel=0.02)
-
-
-def test_the_true_model_of_a_long_range_coupling_reaches_as_far_as_the_way_it_was_found_in():
-    """What is drawn for other faults must not change an effect's own parameters."""
-    drawn = make(
-        systems.find("phi4"), "long-range", 10.0, np.random.default_rng(1), Conditions(sites=9, samples=30, span=6.0)
-    ).about
-    own = {"reach", "open", "scale", "step", "width", "at", "omega", "delay", "s"}
-    assert own & set(drawn) == {"at", "width", "omega", "delay", "s"}

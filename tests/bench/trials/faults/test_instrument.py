@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.signal import lfilter
 
 from latticebench import systems
@@ -296,9 +296,18 @@ def test_resampled_rows_lie_on_straight_lines_between_the_recorders_own(name):
 
 
 def test_jitter_moves_rows_by_times_that_differ():
-    one = drawn("phi4", "clock", z=40)
+    one = drawn("phi4", "other: jittered-rows", z=40)
     plain = drawn("phi4", NONE)
     moved = one.clean.u - plain.clean.u
     late = np.sum(moved * plain.clean.v, axis=1) / np.sum(plain.clean.v**2, axis=1)
     assert np.std(late) > 3 * abs(np.mean(late)) / np.sqrt(len(late))
     assert np.array_equal(one.samples.t, plain.samples.t)
+
+
+def test_a_slow_clock_is_late_in_proportion_to_the_time():
+    one, plain = drawn("phi4", "clock"), drawn("phi4", NONE)
+    late = np.real(one.amount) * plain.clean.t
+    later = CubicHermiteSpline(plain.clean.t, plain.clean.u, plain.clean.v)(plain.clean.t + late)
+    inside = plain.clean.t + late <= plain.clean.t[-1]
+    np.testing.assert_allclose(one.clean.u[inside], later[inside], atol=2e-4)
+    assert np.max(np.abs(one.clean.u - plain.clean.u)) > 1e-2

@@ -1,0 +1,214 @@
+"""What is put into a chain or its sensors: which effects make sense there, how large they may be, and their parameters.
+
+Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
+"cos", "sin" and "omega" (of a drive), "offset_2" and "gain_2" (of the second sensor, which reads gain * u + offset),
+and "curve" (c in u + c u^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.bench.trials.laboratory.chains import Chain
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+OFFSET, GAIN, CURVE, DRIVE, MASSES = "sensor-offset", "sensor-gain", "sensor-curve", "drive", "unequal-masses"
+TAKING = ("damping", "quadratic-drag", "dry-friction")
+AT_ONE_SITE = ("defect", MASSES)
+COUPLED = ("nonlinear-coupling", "asymmetric-coupling")
+MOST_EFFECTS = 5
+# What is asked for instead of names.
+ANY, NONE = "any", "none"
+DECLARED = {"onsite-linear": "u[n]", "onsite-cubic": "u[n]**3"}
+NAMES = (
+    OFFSET, GAIN, CURVE, *TAKING, "onsite-linear", "onsite-quadratic", "onsite-cubic", "onsite-quintic", *AT_ONE_SITE,
+    *COUPLED, "next-neighbour", DRIVE, "constant-force",
+)  # fmt: skip
+# How often each is drawn, where 1 is not given: what most recordings have.
+OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
+HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
+"""Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ingredient:
+    """An effect with the direction of its parameters; their true values are `amount` times that.
+
+    Attributes:
+        name: of the catalogue.
+        site: where it acts, or None.
+        direction: its parameters at an amount of 1.
+        most: the largest amount.
+        fixed: further parameters, whatever the amount: the frequency of a drive.
+        strong: an amount that it has whatever its size; 0 for one that is chosen by its size.
+    """
+
+    name: str
+    site: int | None
+    direction: Mapping[str, float]
+    most: float
+    fixed: Mapping[str, float]
+    strong: float = 0.0
+
+    @property
+    def tangent(self) -> float:
+        """The largest amount for which what the tangent promises of it can be believed.
+
+        A factor must not come near 0: on the tangent, a site without mass is a site without any other effect.
+        """
+        return 0.9 if self.name in (GAIN, MASSES) else 10 * self.most
+
+    def key(self, parameter: str) -> str:
+        """Return the name of one of its parameters among all of a chain's, see `Chain.rate`."""
+        if self.name == DRIVE:
+            return f"drive.{parameter}"
+        if self.name == "disorder":
+            return f"defect@{int(parameter.partition('_')[2]) - 1}"
+        if self.name in AT_ONE_SITE:
+            return f"{self.name}@{self.site}"
+        return self.name if parameter == "coefficient" else parameter
+
+    def unit(self, parameter: str) -> float:
+        """Return the unit of a parameter: the root mean square of all at an amount of 1."""
+        if parameter in self.fixed:
+            return 0.01 * abs(self.fixed[parameter])
+        return float(np.sqrt(np.mean(np.square(list(self.direction.values())))))
+
+    def values(self, amount: float) -> dict[str, float]:
+        """Return its parameters; a gain as what it is beyond 1."""
+        return {**{name: amount * value for name, value in self.direction.items()}, **self.fixed}
+
+    def truth(self, amount: float) -> dict[str, float]:
+        """Return its parameters as they are said: a gain as the factor."""
+        return {name: value + name.startswith("gain") for name, value in self.values(amount).items()}
+
+
+def sensible(chain: Chain, reach: int) -> list[str]:
+    """Return the effects that have a meaning in a chain.
+
+    Args:
+        chain: which.
+        reach: sites at either end that are only read; more than 0 where the ends are unknown.
+    """
+    inner = chain.sites - 2 * reach
+    found = []
+    for name in NAMES:
+        if DECLARED.get(name) in chain.declared:
+            continue
+        if name in (GAIN, *AT_ONE_SITE) and inner < 2:
+            continue
+        if name in COUPLED and not (chain.coupled and chain.sites >= 2):
+            continue
+        if name == "next-neighbour" and (not chain.coupled or inner < 4 or reach == 1):
+            continue
+        found.append(name)
+    return found
+
+
+def draw_ingredient(name: str, chain: Chain, reach: int, draw: np.random.Generator) -> Ingredient:
+    """Return an effect at a place and with a direction.
+
+    Args:
+        name: of the effect.
+        chain: what it is put into.
+        reach: sites at either end that are only read.
+        draw: for place, sign and direction.
+    """
+    inner = np.arange(reach, chain.sites - reach)
+    site = int(draw.choice(inner))
+    sign = -1.0 if name in TAKING else float(draw.choice([-1.0, 1.0]))
+    if name == OFFSET:
+        return _offset(chain, inner, draw)
+    if name == GAIN:
+        return _gain(chain, inner, draw)
+    if name == DRIVE:
+        phase = draw.uniform(0, 2 * np.pi)
+        force = chain.slow**2 * chain.size
+        omega = np.exp(draw.uniform(np.log(0.3 * chain.slow), np.log(1.3 * chain.fast)))
+        waves = {"cos": force * np.cos(phase), "sin": force * np.sin(phase)}
+        return Ingredient(name, None, waves, 0.5, {"omega": float(omega)})
+    return ingredient(name, chain, site, sign)
+
+
+def ingredient(name: str, chain: Chain, site: int, sign: float = 1.0) -> Ingredient:
+    """Return an effect with one parameter; the site counts where it acts at one."""
+    if name == CURVE:
+        return Ingredient(name, None, {"curve": sign / chain.size}, 0.15, {})
+    if name == GAIN:
+        return Ingredient(name, site, {f"gain_{site + 1}": sign}, 0.4, {})
+    if name == MASSES:
+        return Ingredient(name, site, {"scale": sign}, 0.9 if sign > 0 else 0.45, {})
+    unit, most = _unit(name, chain)
+    return Ingredient(name, site if name == "defect" else None, {"coefficient": sign * unit}, most, {})
+
+
+def candidates(chain: Chain, reach: int) -> list[Ingredient]:
+    """Return what might be there instead of an effect: each effect at each place, and three that are never put in."""
+    inner = range(reach, chain.sites - reach)
+    found = [Ingredient(OFFSET, None, {f"offset_{k + 1}": chain.size for k in range(chain.sites)}, 1.0, {})]
+    for name in sensible(chain, reach):
+        if name not in (OFFSET, DRIVE):
+            places = inner if name in (GAIN, *AT_ONE_SITE) else inner[:1]
+            found += [ingredient(name, chain, site) for site in places]
+    if len(inner) > 1:
+        found += [ingredient("gradient", chain, 0), ingredient("trap", chain, 0)]
+        found.append(Ingredient("disorder", None, {f"site_{k + 1}": chain.slow**2 for k in inner}, 1.0, {}))
+    return found
+
+
+def _unit(name: str, chain: Chain) -> tuple[float, float]:
+    """Return a coefficient that changes the motion by about as much as itself, and how many of it there may be."""
+    slow, size, span, coupling = chain.slow, chain.size, chain.span, chain.coupling
+    return {
+        "damping": (1 / span, 4.0),
+        "quadratic-drag": (1 / (slow * size * span), 5.0),
+        "dry-friction": (size * slow / span, 0.8),
+        "onsite-linear": (slow**2, 0.4),
+        "onsite-quadratic": (slow**2 / size, 0.25),
+        "onsite-cubic": (slow**2 / size**2, 0.4),
+        "onsite-quintic": (slow**2 / size**4, 0.4),
+        "constant-force": (slow**2 * size, 0.3),
+        "gradient": (slow**2 * size, 0.3),
+        "trap": (slow**2, 0.3),
+        "defect": (slow**2, 0.4),
+        "next-neighbour": (coupling, 0.15),
+        "nonlinear-coupling": (coupling / size**2, 0.3),
+        "asymmetric-coupling": (coupling, 0.2),
+    }[name]
+
+
+def _offset(chain: Chain, inner: ndarray, draw: np.random.Generator) -> Ingredient:
+    """Return an offset of every sensor, or of one."""
+    if draw.uniform() < 0.7:
+        each = {f"offset_{k + 1}": chain.size * draw.normal() for k in range(chain.sites)}
+        site = None
+    else:
+        site = int(draw.choice(inner))
+        each = {f"offset_{site + 1}": chain.size * float(draw.choice([-1.0, 1.0]))}
+    strong = float(np.exp(draw.uniform(np.log(0.05), np.log(1.0)))) if draw.uniform() < 0.4 else 0.0
+    return Ingredient(OFFSET, site, each, 2.0, {}, strong)
+
+
+def _gain(chain: Chain, inner: ndarray, draw: np.random.Generator) -> Ingredient:
+    """Return a scale of one sensor, or now and then of several, that is a few per cent off or another one."""
+    site = int(draw.choice(inner))
+    sign = float(draw.choice([-1.0, 1.0]))
+    if draw.uniform() < 0.4:
+        factor = draw.uniform(1.15, 1.8) if sign > 0 else draw.uniform(0.6, 0.85)
+        return Ingredient(GAIN, site, {f"gain_{site + 1}": sign}, 0.8, {}, abs(factor - 1))
+    if len(inner) > 2 and draw.uniform() < 0.3:
+        # Not of all: one scale is that of the motion.
+        several = {f"gain_{k + 1}": float(draw.normal()) for k in inner[:-1]}
+        return Ingredient(GAIN, None, several, 0.2, {})
+    return ingredient(GAIN, chain, site, sign)
+
+
+def is_held_out(names: set[str]) -> bool:
+    """Return whether a combination of effects holds one of `HELD_OUT`."""
+    return any(one <= names for one in HELD_OUT)

@@ -1,0 +1,204 @@
+"""How a diagnosis of a laboratory recording is judged: what it names, against what is in it.
+
+Each effect must be named, alone or in a group of effects that the diagnosis says it cannot tell apart, by a finding of
+its own; what is found beyond that is invented. Several offsets, or gains, of different sensors are one effect.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+    from latticebench.bench.trials.laboratory.making import LabRecording
+    from latticebench.diagnosis.fitting import Fitted
+    from latticebench.diagnosis.repair import Diagnosis
+
+# Effects of which one may be found at several sensors.
+ONE_FOR_ALL = ("sensor-offset", "sensor-gain")
+# Labels of values that are no coefficient of a term, with the names that recordings have for them.
+NAMED = {"omega": "omega", "curve of u": "curve", "scale": "scale"}
+# Half the width of a 95 % interval, in standard errors.
+HALF = 1.959964
+# A forecast is worse when its error has grown by more than this share of itself.
+WORSE = 0.05
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that a diagnosis names.
+
+    Attributes:
+        name: of the catalogue.
+        site: where it acts (0, ..., N-1), or None.
+        values: value and standard error of each parameter, called as in `bench.trials.laboratory.effects`.
+        alternatives: effects that it cannot be told from.
+    """
+
+    name: str
+    site: int | None
+    values: Mapping[str, tuple[float, float]]
+    alternatives: tuple[str, ...] = ()
+
+    @property
+    def group(self) -> frozenset[str]:
+        """The effect and those that it cannot be told from."""
+        return frozenset({self.name, *self.alternatives})
+
+
+def findings(diagnosis: Diagnosis) -> tuple[Finding, ...]:
+    """Return what a diagnosis names, with its values called as parameters of recordings are."""
+    return tuple(Finding(one.name, one.site, called(one.values), one.alternatives) for one in diagnosis.findings)
+
+
+def called(values: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """Return values by the names that `bench.trials.laboratory.effects` has for them: a gain as the factor.
+
+    Args:
+        values: by the labels of the diagnosis, "gain of u2", "cos(3.1*t)", "-v[n]", ...
+    """
+    found = {}
+    for label, (value, error) in values.items():
+        sensor, wave = re.match(r"(offset|gain) of u(\d+)", label), re.match(r"(cos|sin)\(.*\*t\)", label)
+        if sensor is not None:
+            found[f"{sensor[1]}_{sensor[2]}"] = (value + (sensor[1] == "gain"), error)
+        elif wave is not None:
+            found[wave[1]] = (value, error)
+        else:
+            found[NAMED.get(label, "coefficient")] = (value, error)
+    return found
+
+
+def residual(fitted: Fitted, noise: Float[ndarray, " sites"]) -> float:
+    """Return the root mean square of what a fit leaves of the readings, those of each sensor over its noise."""
+    left = np.concatenate([(one.seen - one.level)[:, 0, 0] for one in fitted.curves()]) / noise
+    read = left[np.isfinite(left)]
+    return float(np.sqrt(np.mean(read**2))) if len(read) else float("nan")
+
+
+def written(recording: LabRecording) -> list[dict[str, Any]]:
+    """Return what is in a recording as JSON can hold it."""
+    return [
+        {
+            "name": one.name, "site": one.site, "parameters": dict(one.parameters), "z": one.z, "apart": one.apart,
+            "alike": list(one.alike), "sites": list(one.sites),
+        }
+        for one in recording.effects
+    ]  # fmt: skip
+
+
+def matched(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], *, alike: bool = False) -> list[int | None]:
+    """Return which finding names each effect, as many effects as possible being named; None for none.
+
+    Args:
+        truth: effects, as `written` gives them.
+        found: by the diagnosis.
+        alike: count an effect that does the same in these readings as the effect itself.
+    """
+    wanted = [{one["name"], *(one["alike"] if alike else ())} for one in truth]
+    # Whether it is named by its own name, by its group, or not.
+    worth = np.array([
+        [0.0 if not one & each.group else 1.01 if truth[k]["name"] == each.name else 1.0 for each in found]
+        for k, one in enumerate(wanted)
+    ]).reshape(len(truth), len(found))  # fmt: skip
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(-worth)
+    pairs = {int(k): int(j) for k, j in zip(rows, columns, strict=True) if worth[k, j] > 0}
+    return [pairs.get(k) for k in range(len(truth))]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a diagnosis is worth.
+
+    Attributes:
+        named: effects that were named, each once.
+        missed: effects that were not.
+        invented: what was found that is not there.
+        right: whether nothing was missed or invented.
+        right_alike: the same where effects that do the same in these readings count as one.
+        placed: of the effects at one site that were named, how many at a site where they do
+            the same, and how many there are.
+        covered: of the parameters of effects found by name and place, how many 95 % intervals hold the true value, and
+            how many there are.
+    """
+
+    named: tuple[str, ...]
+    missed: tuple[str, ...]
+    invented: tuple[str, ...]
+    right: bool
+    right_alike: bool
+    placed: tuple[int, int]
+    covered: tuple[int, int]
+
+
+def judge(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding]) -> Judgement:
+    """Return how well findings agree with what is in a recording.
+
+    Args:
+        truth: effects, as `written` gives them.
+        found: by the diagnosis.
+    """
+    pairs = matched(truth, found)
+    named = tuple(one["name"] for one, j in zip(truth, pairs, strict=True) if j is not None)
+    missed = tuple(one["name"] for one, j in zip(truth, pairs, strict=True) if j is None)
+    invented = _beyond(truth, found, pairs)
+    loose = matched(truth, found, alike=True)
+    right_alike = None not in loose and not _beyond(truth, found, loose)
+    placed, covered = [], []
+    for one, j in zip(truth, pairs, strict=True):
+        if j is None or found[j].name != one["name"]:
+            continue
+        there = one["site"] == found[j].site
+        if one["site"] is not None:
+            placed.append(found[j].site in one["sites"])
+        if there or one["name"] in ONE_FOR_ALL:
+            covered += list(_intervals(one["parameters"], _together(found, j)))
+    return Judgement(
+        named, missed, invented, not missed and not invented, right_alike, (sum(placed), len(placed)),
+        (sum(covered), len(covered)),
+    )  # fmt: skip
+
+
+def _beyond(
+    truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], pairs: Sequence[int | None]
+) -> tuple[str, ...]:
+    """Return the names of findings that are not there."""
+    spare = [one for j, one in enumerate(found) if j not in pairs]
+    there = {one["name"] for one in truth}
+    return tuple(one.name for one in spare if not (one.name in ONE_FOR_ALL and one.name in there))
+
+
+def _together(found: Sequence[Finding], j: int) -> dict[str, tuple[float, float]]:
+    """Return the values of a finding, with those of all of its name where they are one effect."""
+    if found[j].name not in ONE_FOR_ALL:
+        return dict(found[j].values)
+    alike = (one.values.items() for one in found if one.name == found[j].name)
+    return dict(itertools.chain.from_iterable(alike))
+
+
+def _intervals(parameters: Mapping[str, float], values: Mapping[str, tuple[float, float]]) -> list[bool]:
+    """Return whether each interval that is given holds the true value."""
+    return [
+        abs(values[name][0] - true) <= HALF * values[name][1]
+        for name, true in parameters.items()
+        if name in values and np.isfinite(values[name][1]) and values[name][1] > 0
+    ]
+
+
+def found_in(result: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """Return the findings of a stored result."""
+    found = []
+    for one in result["findings"]:
+        values = {name: (value, np.nan if error is None else error) for name, (value, error) in one["values"].items()}
+        found.append(Finding(one["name"], one["site"], values, tuple(one["alternatives"])))
+    return tuple(found)

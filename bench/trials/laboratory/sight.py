@@ -1,0 +1,248 @@
+"""What readings tell of effects: Fisher's information of all that is unknown in a chain and its sensors.
+
+Sensitivities are differences between copies of the chain, which differ in one parameter each and are solved together
+with the same steps, so that the errors of the integration cancel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.bench.trials.information import explained
+from latticebench.bench.trials.laboratory.chains import Chain
+from latticebench.bench.trials.laboratory.effects import Ingredient
+from latticebench.bench.trials.laboratory.instruments import Instrument
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+    from numpy import ndarray
+
+# The last fifth of the readings must be at least this share of them all (RMS about the mean), and no swing larger than
+# so many times the chain's size.
+MOVING, BOUND = 0.12, 4.0
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Relative tolerance of the integration, and the step of differences in the unit of each parameter."""
+
+    tolerance: float
+    step: float
+
+
+ROUGH, FINE = Accuracy(1e-6, 1e-5), Accuracy(1e-10, 1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What readings tell of effects.
+
+    Attributes:
+        clean: readings without noise (T, N).
+        rms: of these about their means.
+        information: Fisher's, of all parameters, each in its own unit.
+        parts: per effect, the places of its parameters in `information` and its direction in their units.
+        amounts: of the effects.
+        limits: their largest amounts.
+    """
+
+    clean: Float[ndarray, "time sites"]
+    rms: float
+    information: Float[ndarray, "parameters parameters"]
+    parts: tuple[tuple[ndarray, ndarray], ...]
+    amounts: Float[ndarray, " effects"]
+    limits: Float[ndarray, " effects"]
+
+    def whole(self, k: int) -> float:
+        """Return the length of what an amount of 1 of an effect does to the readings, in units of the noise."""
+        place, direction = self.parts[k]
+        return float(np.sqrt(direction @ self.information[np.ix_(place, place)] @ direction))
+
+    def left(self, k: int, beside: Sequence[int]) -> float:
+        """Return what of that nothing else can do: neither the declared equation nor the effects `beside`."""
+        return self._explained({k: 1.0}, beside)[0]
+
+    def instead(self, gone: Sequence[int], beside: Sequence[int], other: int) -> tuple[float, float]:
+        """Return what effects leave where another one is in their place, and how much of that one it takes.
+
+        Args:
+            gone: the effects, with their amounts.
+            beside: the effects that are there.
+            other: the one that takes their place.
+
+        Returns:
+            the first in units of the noise, the second as an amount.
+        """
+        left, does = self._explained({k: float(self.amounts[k]) for k in gone}, [*beside, other])
+        place, direction = self.parts[other]
+        return left, float(np.linalg.norm([does[int(p)] for p in place]) / np.linalg.norm(direction))
+
+    def _explained(self, gone: Mapping[int, float], beside: Sequence[int]) -> tuple[float, dict[int, float]]:
+        """Return what of effects nothing else can do, and how much of each other parameter does the rest.
+
+        Args:
+            gone: amounts of the effects.
+            beside: the effects that are there; those of `gone` are not.
+        """
+        change = np.zeros(len(self.information))
+        for k, amount in gone.items():
+            place, direction = self.parts[k]
+            change[place] += amount * direction
+        of_effects = {int(p) for places, _ in self.parts for p in places}
+        there = {int(p) for j in beside if j not in gone for p in self.parts[j][0]}
+        others = np.array([p for p in range(len(self.information)) if p not in of_effects or p in there])
+        left, does = explained(self.information, change, others)
+        return left, dict(zip(others.tolist(), does.tolist(), strict=True))
+
+    def apart(self, k: int, beside: Sequence[int]) -> float:
+        """Return the share of an effect that nothing else can do."""
+        return self.left(k, beside) / max(self.whole(k), 1e-300)
+
+    def size(self, k: int, beside: Sequence[int]) -> float:
+        """Return the size z of an effect."""
+        return float(self.amounts[k]) * self.left(k, beside)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the motion goes on to the end."""
+        about = self.clean - self.clean.mean(axis=0)
+        last = about[-len(about) // 5 :]
+        last = last - last.mean(axis=0)
+        return bool(np.sqrt(np.mean(last**2)) > MOVING * np.sqrt(np.mean(about**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A chain in front of an instrument.
+
+    Attributes:
+        chain: what moves.
+        instrument: what reads.
+        times: when it does.
+        gone: readings that are missing.
+        reach: sites at either end that are only read, where the ends are unknown.
+    """
+
+    chain: Chain
+    instrument: Instrument
+    times: Float[ndarray, " time"]
+    gone: Bool[ndarray, "time sites"]
+    reach: int
+
+    def look(self, effects: Sequence[Ingredient], amounts: ndarray, accuracy: Accuracy) -> Sight | None:
+        """Return what is seen of effects of these amounts; None where the motion is unbounded."""
+        table = self._declared()
+        parts = []
+        for one, amount in zip(effects, amounts, strict=True):
+            values = one.values(amount)
+            rows = {name: table.add(one.key(name), values[name], one.unit(name)) for name in values}
+            # The frequency of a drive belongs to it, but is no part of its size.
+            place = np.array([rows[name] for name in one.direction])
+            parts.append((place, np.array([value / one.unit(name) for name, value in one.direction.items()])))
+        readings = self._readings(table.copies(accuracy.step), accuracy.tolerance)
+        if readings is None:
+            return None
+        clean = readings[0]
+        rms = float(np.sqrt(np.mean(np.var(clean, axis=0))))
+        columns = np.moveaxis((readings[1:] - clean) / accuracy.step, 0, -1)
+        weighed = self.instrument.whitened(columns, clean, rms) * ~self.gone.reshape(-1, 1)
+        limits = np.array([one.most for one in effects])
+        return Sight(clean, rms, weighed.T @ weighed, tuple(parts), np.asarray(amounts), limits)
+
+    def _declared(self) -> _Table:
+        """Return the start and the declared coefficients."""
+        chain, table = self.chain, _Table()
+        for level, unit in enumerate((chain.size, chain.size * chain.fast)):
+            for k in range(chain.sites):
+                inner = self.reach <= k < chain.sites - self.reach
+                table.add(f"start.{level}.{k}", chain.start[level, k], unit, free=inner)
+        for text, value in zip(chain.declared, chain.coefficients, strict=True):
+            table.add(text, value, abs(value))
+        return table
+
+    def _readings(self, of: Mapping[str, ndarray], tolerance: float) -> Float[ndarray, "copies time sites"] | None:
+        """Return the readings of copies of the chain with these parameters; None where one is unbounded."""
+        from scipy.integrate import solve_ivp
+
+        chain, sites = self.chain, self.chain.sites
+        start = np.stack([np.concatenate([of[f"start.{level}.{k}"] for k in range(sites)], axis=1) for level in (0, 1)])
+        outer = [k for k in range(sites) if not self.reach <= k < sites - self.reach]
+        sensors = _Sensors(of, sites)
+        moving = {name: value for name, value in of.items() if not name.startswith("start.") and np.any(value != 0)}
+
+        def rate(t: float, y: ndarray) -> ndarray:
+            u, v = y.reshape(start.shape)
+            return np.concatenate([v.ravel(), chain.rate(t, sensors.held(u, outer), v, moving).ravel()])
+
+        def lost(_t: float, y: ndarray) -> float:
+            return BOUND * chain.size - float(np.max(np.abs(y[:sites])))
+
+        lost.terminal = True  # type: ignore[attr-defined]
+        small = np.repeat([chain.size, chain.size * chain.fast], start[0].size) * tolerance * 0.1
+        with np.errstate(all="ignore"):
+            found = solve_ivp(
+                rate, (0.0, float(self.times[-1])), start.ravel(), t_eval=self.times, method="DOP853",
+                rtol=tolerance, atol=small, events=lost,
+            )  # fmt: skip
+        if found.status != 0 or not np.all(np.isfinite(found.y)):
+            return None
+        u = np.moveaxis(found.y.reshape(*start.shape, -1)[0], -1, 0)
+        return np.moveaxis(np.stack([sensors.read(sensors.held(row, outer)) for row in u]), 0, 1)
+
+
+class _Table:
+    """Parameters with their values and units, and copies in each of which one of them is a little different."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, float] = {}
+        self.places: dict[str, int] = {}
+        self.units: list[float] = []
+
+    def add(self, name: str, value: float, unit: float, *, free: bool = True) -> int:
+        """Add a parameter and return its place among the free ones; one that is there is kept."""
+        if name in self.values:
+            return self.places[name]
+        self.values[name] = float(value)
+        if free:
+            self.places[name] = len(self.units)
+            self.units.append(unit)
+        return len(self.units) - 1
+
+    def copies(self, step: float) -> dict[str, ndarray]:
+        """Return the value of each parameter in each copy (copies, 1); the first copy has them as they are."""
+        found = {name: np.full((len(self.units) + 1, 1), value) for name, value in self.values.items()}
+        for name, place in self.places.items():
+            found[name][place + 1] += step * self.units[place]
+        return found
+
+
+class _Sensors:
+    """What the sensors make of positions, per copy."""
+
+    def __init__(self, of: Mapping[str, ndarray], sites: int) -> None:
+        zero = np.zeros((len(next(iter(of.values()))), 1))
+
+        def row(name: str) -> ndarray:
+            return np.concatenate([of.get(f"{name}_{k + 1}", zero) for k in range(sites)], axis=1)
+
+        self.offset, self.gain = row("offset"), 1 + row("gain")
+        self.curve = of.get("curve", zero)
+
+    def read(self, u: Float[ndarray, "copies sites"]) -> ndarray:
+        """Return the readings."""
+        return np.asarray(self.gain * u + self.offset + self.curve * u**2)
+
+    def held(self, u: Float[ndarray, "copies sites"], outer: Sequence[int]) -> ndarray:
+        """Return positions with the outer ones such that every copy has the readings of the first there."""
+        if not outer:
+            return u
+        first = u[0]
+        wrong = (self.gain - self.gain[0]) * first + self.offset - self.offset[0]
+        wrong = wrong + (self.curve - self.curve[0]) * first**2
+        found = u.copy()
+        found[:, outer] = (first - wrong / (self.gain[0] + 2 * self.curve[0] * first))[:, outer]
+        return found
