@@ -2,7 +2,8 @@
 
 A kind of case is a frozen model of the settings that decide its result, in a file of its own with the code that
 computes it: a fit of simulated samples (`bench.fitting`), the diagnosis of a recording with a known effect
-(`bench.trials.trial`), the diagnosis of a measured recording (`bench.trials.measured`). `bench.kinds` lists them.
+(`bench.trials.trial`), of one as a laboratory makes it (`bench.trials.laboratory.case`), and of a measured recording
+(`bench.trials.measured`). `bench.kinds` lists them.
 """
 
 from __future__ import annotations

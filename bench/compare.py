@@ -13,7 +13,7 @@ Runs are compared case by case in a table of a common form, whatever their kind:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,12 @@ from latticebench.systems.errors import InputError
 # Round-off differs between machines; errors below this are all the same.
 FLOOR = 1e-9
 FACTOR = 2.0
-NEEDED_OF_FITS = ("identity", "data", "library", "method", "seed", "status", "e2", "residual")
-NEEDED_OF_TRIALS = ("system", "effect", "z", "noise", "velocities", "seed", "status", "right", "residual_after")
+TABLES = ("cases.csv", "trials.csv", "laboratory.csv")
+NEEDED: Mapping[str, Sequence[str]] = {
+    "fit": ("identity", "data", "library", "method", "seed", "status", "e2", "residual"),
+    "trial": ("system", "effect", "z", "noise", "velocities", "seed", "status", "right", "residual_after"),
+    "laboratory": ("asked", "seed", "status", "right", "residual_after"),
+}
 COLUMNS = ("identity", "case", "status", "right", "e2", "residual")
 
 
@@ -126,19 +130,22 @@ def read_run(path: Path) -> pd.DataFrame:
             return pd.concat(parts, ignore_index=True)
     if not path.is_file():
         raise InputError(
-            f"{path}: no results; give a store of them, a folder of published tables, a cases.csv or a trials.csv"
+            f"{path}: no results; give a store of them, a folder of published tables, or one of {', '.join(TABLES)}"
         )
     frame = read_table(path)
-    form, needed = (of_trials, NEEDED_OF_TRIALS) if "effect" in frame else (of_fits, NEEDED_OF_FITS)
+    kind = "laboratory" if "asked" in frame else "trial" if "effect" in frame else "fit"
+    form, needed = FORMS[kind], NEEDED[kind]
     missing = [name for name in needed if name not in frame]
     if missing:
-        raise InputError(f"{path}: neither a table of cases nor of trials: the column {missing[0]!r} is missing")
+        raise InputError(
+            f"{path}: no table of cases, trials or laboratory recordings: the column {missing[0]!r} is missing"
+        )
     return form(frame)
 
 
 def _published(folder: Path) -> list[pd.DataFrame]:
     """Return what was published of fits, trials and recordings in a folder itself."""
-    parts = [read_run(folder / name) for name in ("cases.csv", "trials.csv") if (folder / name).is_file()]
+    parts = [read_run(folder / name) for name in TABLES if (folder / name).is_file()]
     if (folder / "measured.md").is_file():
         parts.append(_reports(sorted(folder.glob("*.json"))))
     return parts
@@ -166,7 +173,14 @@ def of_recordings(frame: pd.DataFrame) -> pd.DataFrame:
     return _common(frame, identity=frame["name"], case=frame["name"], residual=frame["residual_after"])
 
 
-FORMS = {"fit": of_fits, "trial": of_trials, "measured": of_recordings}
+def of_laboratory(frame: pd.DataFrame) -> pd.DataFrame:
+    """Bring a table of laboratory recordings (`bench.trials.laboratory.tables`) into the common form."""
+    title = "laboratory " + frame["asked"] + " | seed " + frame["seed"].astype(str)
+    right = frame["right"].map({True: True, False: False, "True": True, "False": False})
+    return _common(frame, identity=title, case=title, right=right, residual=frame["residual_after"])
+
+
+FORMS = {"fit": of_fits, "trial": of_trials, "laboratory": of_laboratory, "measured": of_recordings}
 
 
 def _reports(paths: Iterable[Path]) -> pd.DataFrame:

@@ -62,7 +62,15 @@ def _measured() -> Kind:
     return Kind(found.TABLES, found.FIGURES, found.table, found.show, found.publish, found.draw_all)
 
 
-KINDS: Mapping[str, Callable[[], Kind]] = {"fit": _fit, "trial": _trial, "measured": _measured}
+def _laboratory() -> Kind:
+    from latticebench.bench.trials.laboratory import tables
+
+    return Kind(tables.TABLES, tables.FIGURES, tables.table, tables.show, tables.publish, tables.draw_all)
+
+
+KINDS: Mapping[str, Callable[[], Kind]] = {
+    "fit": _fit, "trial": _trial, "laboratory": _laboratory, "measured": _measured,
+}  # fmt: skip
 
 
 def each(

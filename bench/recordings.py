@@ -71,6 +71,14 @@ RECORDINGS: tuple[Recording, ...] = (
         "cc9fcc87411b48d0592e6ebe1945df43b12de1ce8e1f2d67a6d153efa2c9e37f",
     ),
     Recording(
+        "carts",
+        "two carts on a track, with springs between them and to both walls, released by hand; positions from rest in "
+        "cm, read by two laser rangefinders that look from opposite ends, in steps of 0.068",
+        "t,u1,u2", 461, "about 33 Hz (steps of 0.02, 0.03 or 0.04 s)",
+        "Jeffreymaomao/Coupled-Oscillators.github.io, 2023-6-13-11-10.csv from 9.9 s on", "none stated",
+        "a877beb2851d552c004446ead579ef3297ea95b77627a5e89ce338a5d07a1929",
+    ),
+    Recording(
         "silverbox",
         "an electronic circuit that behaves much like a Duffing oscillator (u1, V), driven by a known voltage (f1, V), "
         "both without their means: first noise of growing size, then ten multisine blocks with pauses",

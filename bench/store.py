@@ -24,7 +24,7 @@ from typing import Any
 from latticebench.bench.case import STATUSES, Case
 from latticebench.systems.errors import InputError
 
-VERSION = 3
+VERSION = 4
 FILE = "results.sqlite"
 # In the head of the file, by which a store is known: "LtBn".
 APPLICATION = 0x4C74426E

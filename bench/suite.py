@@ -20,13 +20,18 @@
     systems = ["phi4"]
     z = [5, 10, 30]
 
+    [[laboratory]]                  # diagnoses of recordings as laboratories make them: every combination of the lists
+    instruments = ["each"]          # see `bench.trials.laboratory.case.Batch`
+    effects = ["any", "none"]
+    seeds = "1-100"
+
     [[measured]]                    # the diagnosis of one measured recording, see `bench.trials.measured.Measured`
     name = "gliders"
     file = "gliders.csv"
     terms = "u[n+1]+u[n-1]-2*u[n]; u[n]"
     order = 2
 
-A suite may have blocks of all three kinds. Paths are relative to the suite file, those of recordings to the folder of
+A suite may have blocks of all kinds. Paths are relative to the suite file, those of recordings to the folder of
 recordings.
 """
 
@@ -57,6 +62,7 @@ class _File(Settings):
     defaults: dict[str, Any] = {}
     grid: list[dict[str, Any]] = []
     made: list[dict[str, Any]] = []
+    laboratory: list[dict[str, Any]] = []
     measured: list[dict[str, Any]] = []
 
 
@@ -116,9 +122,9 @@ def load(name: str, data: Path = DATA) -> Suite:
     shown = name if name.endswith(".toml") else f"suite {name}"
     file = _checked(_File, read_toml(path), shown)
     folders = Folders(path.resolve().parent, data)
-    if not (file.grid or file.made or file.measured):
-        raise InputError(f"{shown}: no cases; write at least one [[grid]], [[made]] or [[measured]]")
-    cases = [*_fits(file, shown), *_trials(file, shown), *_recordings(file, shown)]
+    if not (file.grid or file.made or file.laboratory or file.measured):
+        raise InputError(f"{shown}: no cases; write at least one [[grid]], [[made]], [[laboratory]] or [[measured]]")
+    cases = [*_fits(file, shown), *_trials(file, shown), *_laboratory(file, shown), *_recordings(file, shown)]
     for label, contestant in file.methods.items():
         try:
             make(methods.find(contestant.method, folders.suite), contestant.settings)
@@ -148,6 +154,17 @@ def _trials(file: _File, shown: str) -> Iterator[Case]:
             made = _checked(Made, block, where)
             with _told(where, Trial):
                 yield from made.cases(where)
+
+
+def _laboratory(file: _File, shown: str) -> Iterator[Case]:
+    if file.laboratory:
+        from latticebench.bench.trials.laboratory.case import Batch, Laboratory
+
+        for number, block in enumerate(file.laboratory, start=1):
+            where = f"{shown}: laboratory {number}"
+            batch = _checked(Batch, block, where)
+            with _told(where, Laboratory):
+                yield from batch.cases(where)
 
 
 def _recordings(file: _File, shown: str) -> Iterator[Case]:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from latticebench.bench.cli.arguments import asked, told
-from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, complete_methods, complete_systems
+from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, complete_systems
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 # The library of a system that has the terms of its own equation.
 EQUATION = "equation"
+# Exit code of a program that Ctrl-C has ended.
+INTERRUPTED = 130
 
 EPILOG = (
     "Examples:  latticebench diagnose phi4.csv --system phi4 --html diagnosis.html\n\n"
@@ -58,21 +61,10 @@ def diagnose(
     html_out: Annotated[
         Path | None, typer.Option("--html", metavar="OUT", help="Write one HTML file with pictures.")
     ] = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            help="Take the declared equation's first coefficients from this method's fit (of `list methods`); whole "
-            "trajectories otherwise.",
-            autocompletion=complete_methods,
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated noise that evidence is judged by.")] = 1,
 ) -> None:
     """Find what a declared equation lacks: trace its residual to an effect, add it, show the error before and after."""
-    from latticebench import methods
     from latticebench.bench.report.screen import watching
-    from latticebench.diagnosis.repair import diagnose as diagnose_data
-    from latticebench.methods.method import make, solve
+    from latticebench.diagnosis import repair
     from latticebench.systems.effects import CATALOGUE
     from latticebench.systems.readers import read_all
     from latticebench.systems.user_files import load_effects
@@ -84,11 +76,22 @@ def diagnose(
     _check_field(known, data)
     # Read together, since the two must be of the same chain.
     later = read_all([*files, *holdout], ends)[len(data) :] if holdout else []
-    with told(data, method, "the diagnosis"), watching() as watcher, redirect_stdout(sys.stderr):
-        fit = None if method is None else solve(make(methods.find(method), {}), data, declared, order, seed)
-        start = None if fit is None else fit.coefficients
-        found = diagnose_data(declared, order, data, catalogue, seed, held_out=later, watcher=watcher, start=start)
-    _report(found, seed, json_out, html_out)
+    with told(data, None, "the diagnosis"), watching() as watcher, redirect_stdout(sys.stderr):
+        run = partial(repair.diagnose, declared, order, data, catalogue, held_out=later, watcher=watcher)
+        found, interrupted = _as_far_as_it_came(run)
+    _report(found, json_out, html_out, interrupted=interrupted)
+    if interrupted:
+        raise typer.Exit(INTERRUPTED)
+
+
+def _as_far_as_it_came(run: Callable[[], Diagnosis]) -> tuple[Diagnosis, bool]:
+    """Return a diagnosis, or what of it was known when Ctrl-C ended it, and whether that was so."""
+    from latticebench.diagnosis.repair import Interrupted
+
+    try:
+        return run(), False
+    except Interrupted as stop:
+        return stop.diagnosis, True
 
 
 def _declared(system: str | None, terms: str | None, order: int | None) -> tuple[System | None, Library, int]:
@@ -122,13 +125,13 @@ def _check_field(known: System | None, data: Sequence[Samples]) -> None:
         )
 
 
-def _report(found: Diagnosis, seed: int, json_out: str | None, html_out: Path | None) -> None:
+def _report(found: Diagnosis, json_out: str | None, html_out: Path | None, *, interrupted: bool) -> None:
     """Show a diagnosis on the screen, and write it as JSON and as a page."""
     from latticebench.bench.report.content import content, diagnosis_document
     from latticebench.bench.report.document import provenance, to_json
     from latticebench.systems.files import write_text
 
-    report, about = content(found), provenance([seed])
+    report, about = content(found, interrupted=interrupted), provenance()
     # Files first: whoever reads the screen may stop reading.
     if html_out is not None:
         from latticebench.bench.report.curves import curves

@@ -81,12 +81,12 @@ def _method_rows() -> list[dict[str, Any]]:
 
 
 def _effect_rows() -> list[dict[str, Any]]:
-    from latticebench.systems.effects import CATALOGUE, HOW
+    from latticebench.systems.effects import CATALOGUE
 
     return [
         {
             "name": one.name, "second order, real": next(iter(one.texts(2, False)), ""),
-            "first order, complex": next(iter(one.texts(1, True)), ""), "how it acts": HOW[one.acts],
+            "first order, complex": next(iter(one.texts(1, True)), ""), "how it acts": one.how,
             "what gives it away": one.look_for, "source": one.source,
         }
         for one in CATALOGUE

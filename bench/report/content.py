@@ -12,13 +12,14 @@ import pydantic
 from latticebench.bench.report.document import Content, Document, Number, Pair, Provenance
 from latticebench.bench.report.equation import Equation, equation
 from latticebench.bench.report.findings import AddedEffect, added, declared
+from latticebench.bench.report.horizons import HorizonReport, horizons
+from latticebench.bench.report.modes import Modes, modes
 from latticebench.bench.report.notes import notes
 from latticebench.bench.report.separation import Separation, separations
-from latticebench.bench.report.whereabouts import Whereabouts, scaled_residuals, whereabouts
+from latticebench.bench.report.whereabouts import Whereabouts, whereabouts
 
 if TYPE_CHECKING:
     from latticebench.diagnosis.repair import Diagnosis
-    from latticebench.diagnosis.search import Round
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unexplained"]
 
@@ -43,28 +44,12 @@ class RecordingSummary(Content):
     ends: str
 
 
-class Ranked(Content):
-    """An entry of a ranking: its evidence (natural logarithm), its p-value, and whether it is in the catalogue."""
-
-    effect: str
-    evidence: Number
-    p: float = pydantic.Field(ge=0, le=1)
-    named: bool
-
-
-class Turn(Content):
-    """A round: the effect that was added, those that explain as much, and all that was tried, the best first."""
-
-    added: str | None
-    equal: tuple[str, ...]
-    ranking: tuple[Ranked, ...]
-
-
 class Errors(Content):
     """Errors before and after.
 
     Attributes:
         residual: of the fit, in units of the noise.
+        rms: of the fit, in the units of the readings.
         forecast: of held-out readings, relative.
         coefficients: of the declared coefficients, relative; None where the truth is not known.
         criterion: the Bayesian information criterion less that of the declared equation.
@@ -72,6 +57,7 @@ class Errors(Content):
     """
 
     residual: Pair
+    rms: Pair
     forecast: Pair
     coefficients: Pair | None
     criterion: Pair
@@ -93,18 +79,19 @@ class Equations(Content):
 
 
 class Left(Content):
-    """Something that is significant in the last residual."""
+    """Something that is significant in the last residual, though it was not named.
+
+    Attributes:
+        effect: its name, or what it is where it has none.
+        site: where it acts (from 1), if at one site.
+        gain: natural logarithm of how much likelier it can make the readings, by a score test.
+        price: what chance alone may gain.
+    """
 
     effect: str
-    p: float
-    named: bool
-
-
-class Rival(Content):
-    """What has no name and does as well in the place of the last effect, and by how much (natural logarithm)."""
-
-    name: str
-    lead: Number
+    site: int | None
+    gain: Number
+    price: Number
 
 
 class Report(Content):
@@ -115,11 +102,15 @@ class Report(Content):
         declared, declared_stderr: coefficients of the declared terms in the last model, with standard errors.
         declared_before, declared_stderr_before: the same in the declared equation alone.
         declared_truth: their true values, or None.
-        noise: standard deviation of the noise on u, of a complex field in total.
+        noise: standard deviation of the noise of each sensor, in the units of its readings; of each part of a complex
+            reading.
+        noise_lines: the noise in words.
         effects: what was added.
         separations: what cannot be told apart, and what would separate it.
-        rounds: what was tried.
+        modes: eigenfrequencies and decay rates beside the peaks of the recording's spectrum.
+        horizons: how the search went.
         left: what is significant in the last residual.
+        interrupted: whether the search was stopped; this is then what was known after the last of `horizons`.
     """
 
     verdict: Verdict
@@ -130,45 +121,51 @@ class Report(Content):
     declared_stderr: dict[str, Number]
     declared_stderr_before: dict[str, Number]
     declared_truth: dict[str, Number] | None
-    noise: Number
+    noise: dict[str, Number]
+    noise_lines: tuple[str, ...]
     effects: tuple[AddedEffect, ...]
     separations: tuple[Separation, ...]
     equation: Equations
-    rounds: tuple[Turn, ...]
+    modes: Modes
+    horizons: tuple[HorizonReport, ...]
     error: Errors
     where: Where
     left: tuple[Left, ...]
-    rival: Rival | None
     notes: tuple[str, ...]
+    interrupted: bool
 
 
 class DiagnosisDocument(Report, Document):
     """A diagnosis, see `latticebench diagnose`."""
 
-    schema_: Literal["latticebench/diagnosis/1"] = pydantic.Field(
-        default="latticebench/diagnosis/1", validation_alias="schema", serialization_alias="schema"
+    schema_: Literal["latticebench/diagnosis/2"] = pydantic.Field(
+        default="latticebench/diagnosis/2", validation_alias="schema", serialization_alias="schema"
     )
 
 
-def content(diagnosis: Diagnosis) -> Report:
-    """Return the content of a diagnosis."""
-    course = diagnosis.course
-    before, before_errors = declared(course.before)
-    after, after_errors = declared(course.after)
-    found = added(diagnosis)
+def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
+    """Return the content of a diagnosis, or of what was known when it was interrupted."""
+    before, before_errors = declared(diagnosis.before)
+    after, after_errors = declared(diagnosis.after)
+    found, chain = added(diagnosis), diagnosis.after.chain
+    sensors = [f"{letter}{site + 1}" for letter in "uv"[: chain.levels] for site in range(chain.sites)]
     return Report(
-        verdict=cast(Verdict, course.verdict), sentence=_sentence(course.verdict, found),
+        verdict=cast(Verdict, diagnosis.verdict), sentence=_sentence(diagnosis.verdict, found),
         recording=_recording(diagnosis),
         declared=after, declared_before=before, declared_stderr=after_errors, declared_stderr_before=before_errors,
         declared_truth=None if diagnosis.truth is None else dict(zip(after, map(float, diagnosis.truth), strict=True)),
-        noise=diagnosis.noise[0] * course.after.records[0].value.shape[2] ** 0.5,
+        noise=dict(zip(sensors, map(float, diagnosis.noise), strict=True)), noise_lines=diagnosis.noise_lines,
         effects=found, separations=separations(diagnosis),
-        equation=Equations(before=equation(course.before), after=equation(course.after)),
-        rounds=tuple(_turn(one) for one in course.rounds), error=_errors(diagnosis),
-        where=Where(before=whereabouts(course.before, diagnosis), after=whereabouts(course.after, diagnosis)),
-        left=tuple(Left(effect=one.name, p=one.p, named=one.named) for one in course.left),
-        rival=None if course.rival is None else Rival(name=course.rival[0], lead=course.rival[1]),
-        notes=notes(diagnosis),
+        equation=Equations(
+            before=equation(diagnosis.before.model, chain), after=equation(diagnosis.after.model, chain)
+        ),
+        modes=modes(diagnosis), horizons=horizons(diagnosis), error=_errors(diagnosis),
+        where=Where(before=whereabouts(diagnosis.before, diagnosis), after=whereabouts(diagnosis.after, diagnosis)),
+        left=tuple(
+            Left(effect=one.name, site=None if one.site is None else one.site + 1, gain=one.gain, price=one.price)
+            for one in diagnosis.left
+        ),
+        notes=notes(diagnosis), interrupted=interrupted,
     )  # fmt: skip
 
 
@@ -194,21 +191,12 @@ def _sentence(verdict: str, found: tuple[AddedEffect, ...]) -> str:
 
 
 def _recording(diagnosis: Diagnosis) -> RecordingSummary:
-    data = diagnosis.course.after.data
+    data = diagnosis.data
     return RecordingSummary(
         sources=tuple(dict.fromkeys(samples.source for samples in data)), sites=data[0].sites,
-        rows=sum(len(samples.t) for samples in data),
-        trajectories=len(scaled_residuals(diagnosis.course.after, diagnosis)),
+        rows=sum(len(samples.t) for samples in data), trajectories=len(data),
         field="complex" if data[0].is_complex else "real", ends=data[0].ends,
     )  # fmt: skip
-
-
-def _turn(one: Round) -> Turn:
-    ranking = [
-        Ranked(effect=entry.name, evidence=entry.evidence, p=entry.p, named=entry.screened.named)
-        for entry in one.ranking
-    ]
-    return Turn(added=one.added, equal=one.equal, ranking=tuple(ranking))
 
 
 def _errors(diagnosis: Diagnosis) -> Errors:
@@ -216,7 +204,7 @@ def _errors(diagnosis: Diagnosis) -> Errors:
         return Pair(before=values[0], after=values[1])
 
     return Errors(
-        residual=pair(diagnosis.residual), forecast=pair(diagnosis.forecast),
+        residual=pair(diagnosis.residual), rms=pair(diagnosis.rms), forecast=pair(diagnosis.forecast),
         coefficients=None if diagnosis.coefficients is None else pair(diagnosis.coefficients),
         criterion=pair(diagnosis.criterion), dynamics=pair(diagnosis.dynamics),
     )  # fmt: skip

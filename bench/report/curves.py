@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,13 +10,11 @@ import numpy as np
 from latticebench.bench.report.whereabouts import scaled_residuals, spectrum
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from jaxtyping import Float
     from numpy import ndarray
 
+    from latticebench.diagnosis.forecast import Prediction
     from latticebench.diagnosis.repair import Diagnosis
-    from latticebench.diagnosis.residual import Prediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +65,8 @@ class WorstForecast:
         trajectory, trajectories: its number (from 1), and how many there are.
         site: its number, from 1.
         before, after: by the declared equation, and by the one with the effects, if there are any.
-        moving: the sites that have an equation.
-        noise: standard deviation of each real part of u.
+        moving: the sites that have an equation, from 0.
+        noise: standard deviation of each real part of u at these sites.
     """
 
     trajectory: int
@@ -76,8 +74,8 @@ class WorstForecast:
     site: int
     before: Prediction
     after: Prediction | None
-    moving: slice
-    noise: float
+    moving: tuple[int, ...]
+    noise: Float[ndarray, " sites"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +92,8 @@ def curves(diagnosis: Diagnosis) -> PictureCurves:
 
 
 def _residuals(diagnosis: Diagnosis) -> WorstResidual:
-    course = diagnosis.course
-    before = scaled_residuals(course.before, diagnosis)
-    number = int(np.argmax([float(np.nanmean(values**2)) for _, values in before]))
+    before = scaled_residuals(diagnosis.before, diagnosis)
+    number = int(np.argmax([np.nansum(values**2) / max(np.sum(np.isfinite(values)), 1) for _, values in before]))
     _, left = before[number]
     counts = np.sum(np.isfinite(left), axis=(0, 2, 3))
     level = int(np.argmax(np.sum(np.nan_to_num(left) ** 2, axis=(0, 2, 3)) / np.maximum(counts, 1)))
@@ -105,46 +102,37 @@ def _residuals(diagnosis: Diagnosis) -> WorstResidual:
         omega, power, _ = spectrum(t, values)
         return ResidualCurve(t, values[:, level], omega, power)
 
-    after = scaled_residuals(course.after, diagnosis)[number] if course.after.model.effects else None
+    after = scaled_residuals(diagnosis.after, diagnosis)[number] if diagnosis.findings else None
     return WorstResidual(
         "uv"[level], number + 1, len(before), curve(*before[number]), None if after is None else curve(*after)
     )
 
 
 def _forecasts(diagnosis: Diagnosis) -> WorstForecast:
-    before, after = (_joined(side) for side in diagnosis.forecasts)
-    moving = diagnosis.course.after.records[0].stretches.dynamics.moving
+    before, after = diagnosis.forecasts
+    moving = diagnosis.after.chain.moving
     # A forecast that ran away is the worst; a site that was not read cannot be.
     sizes = [np.nan_to_num(forecast_error(one, moving, (0, 1)), nan=-1.0, posinf=1e300) for one in before]
     number = int(np.argmax([np.max(size) for size in sizes]))
-    first = range(before[number].seen.shape[-1])[moving][0]
     return WorstForecast(
-        number + 1, len(before), first + int(np.argmax(sizes[number])) + 1, before[number],
-        after[number] if diagnosis.course.after.model.effects else None, moving, float(diagnosis.noise[0]),
+        number + 1, len(before), moving[int(np.argmax(sizes[number]))] + 1, before[number],
+        after[number] if diagnosis.findings else None, moving, np.asarray(diagnosis.noise)[list(moving)],
     )  # fmt: skip
 
 
-def _joined(forecasts: Sequence[Prediction]) -> list[Prediction]:
-    """Return the forecasts of trajectories, whose pieces are put together with gaps between them."""
-    found: list[Prediction] = []
-    for one in forecasts:
-        if not found or one.t[0] <= found[-1].t[-1]:
-            found.append(one)
-            continue
-        last = found[-1]
-        gap = np.full_like(last.seen[:1], np.nan)
-        found[-1] = replace(
-            last,
-            t=np.concatenate([last.t, [(last.t[-1] + one.t[0]) / 2], one.t]),
-            seen=np.concatenate([last.seen, gap, one.seen]),
-            predicted=np.concatenate([last.predicted, gap, one.predicted]),
-        )
-    return found
+def forecast_error(
+    one: Prediction, moving: tuple[int, ...], axis: tuple[int, int], unit: Float[ndarray, " sites"] | float = 1.0
+) -> np.ndarray:
+    """Return the RMS of a forecast's error at the sites that have an equation; NaN where nothing was read.
 
-
-def forecast_error(one: Prediction, moving: slice, axis: tuple[int, int]) -> np.ndarray:
-    """Return the RMS of a forecast's error at the sites that have an equation; NaN where nothing was read."""
-    seen = np.isfinite(one.seen[..., moving])
+    Args:
+        one: the forecast.
+        moving: the sites, from 0.
+        axis: what the mean is over, of time, parts and sites.
+        unit: of the error at each of the sites.
+    """
+    sites = list(moving)
+    seen = np.isfinite(one.seen[..., sites])
     with np.errstate(all="ignore"):
-        wrong = np.square(one.seen - one.predicted)[..., moving]
+        wrong = np.square((one.seen - one.predicted)[..., sites] / unit)
         return np.asarray(np.sqrt(np.sum(np.where(seen, wrong, 0.0), axis=axis) / np.sum(seen, axis=axis)))

@@ -5,17 +5,30 @@ Sites are counted from 1, frequencies are angular ones (as in cos(omega*t)).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from latticebench.bench.report.document import Content, Number
-from latticebench.diagnosis.model import Fitted
-from latticebench.diagnosis.placed import PlacedEffect
-from latticebench.systems.effects import INSTRUMENT
+from latticebench.diagnosis.acting import Placed
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from latticebench.diagnosis.finding import Finding
+    from latticebench.diagnosis.fitting import Fitted
     from latticebench.diagnosis.repair import Diagnosis
+
+# Step of a difference quotient, in standard errors: small against what bends a curve, large against rounding.
+STEP = 1e-3
+
+
+class Size(Content):
+    """A number with its standard error."""
+
+    value: Number
+    stderr: Number
 
 
 class AddedEffect(Content):
@@ -23,100 +36,74 @@ class AddedEffect(Content):
 
     Attributes:
         effect: its name.
+        said: what it does, one sentence each; nothing where its terms say all.
         parameters: where and how it acts: site (from 1), omega, delay, at, width, s, ends, ...
         coefficients: by the text of the term, or by what the instrument does ("offset of u3").
         stderr: standard errors of coefficients and fitted parameters, as far as they are known.
+        natural: its numbers in the form in which people know them: a factor, a mass ratio, a decay time, ...
+        evidence: natural logarithm of how much likelier it makes the readings, in the last model.
         indistinguishable: effects that explain these data as well.
     """
 
     effect: str
-    parameters: dict[str, bool | int | Number | str]
+    said: tuple[str, ...]
+    parameters: dict[str, int | Number | str]
     coefficients: dict[str, Number]
     stderr: dict[str, Number]
+    natural: dict[str, Size]
+    evidence: Number
     indistinguishable: tuple[str, ...] = ()
 
 
 def added(diagnosis: Diagnosis) -> tuple[AddedEffect, ...]:
-    """Return the effects of the last model, in the order in which they were added."""
-    course = diagnosis.course
-    fitted = course.after
-    errors = np.sqrt(np.maximum(np.diag(fitted.solution.covariance), 0.0))
+    """Return the effects that were found, in the order in which the diagnosis gives them."""
+    chain = diagnosis.after.chain
+    frequency = min((one.frequency for one in diagnosis.modes[0]), default=float("nan"))
+
+    def natural(placed: Placed) -> dict[str, float]:
+        return placed.natural(chain, frequency)
+
     found = []
-    pieces = zip(fitted.model.effects, blocks(fitted), course.equal, strict=True)
-    for number, (placed, block, equal) in enumerate(pieces):
-        names = labels(placed, fitted)
-        coefficients = dict(zip(names, map(float, fitted.solution.state.coefficients[block]), strict=True))
-        stderr = dict(zip(names, map(float, errors[block]), strict=True))
-        known = fitted.psi_errors[number] if number < len(fitted.psi_errors) else {}
-        parameters: dict[str, bool | int | float | str] = {} if placed.site is None else {"site": placed.site + 1}
-        if placed.ends:
-            parameters["ends"] = placed.ends
-        for name, value in placed.psi.items():
-            if name in ("inner", "origin"):
-                # Of use to the fit alone.
-                continue
-            if placed.effect.acts in INSTRUMENT and name in placed.free:
-                label = reading(placed, name, fitted.data[0].is_complex)
-                coefficients[label] = float(value)
-            else:
-                label = name
-                parameters[name] = bool(value) if name == "open" else int(value) if name == "reach" else float(value)
-            if name in known:
-                stderr[label] = float(known[name])
-        if placed.effect.acts == "one equation":
-            # The force is what it was; the site answers it as a mass of this size would.
-            ratio = 1 / (1 + float(placed.psi["scale"]))
-            parameters["mass_ratio"] = ratio
-            if "scale" in stderr:
-                stderr["mass_ratio"] = stderr["scale"] * ratio**2
+    for one in diagnosis.findings:
+        placed, labels = one.placed, one.placed.labels(chain)
+        settings, errors = _with_errors(one, Placed.settings), {name: error for name, (_, error) in one.values.items()}
+        errors |= {name: size.stderr for name, size in settings.items() if np.isfinite(size.stderr)}
         found.append(
             AddedEffect(
-                effect=placed.effect.name, parameters=parameters, coefficients=coefficients, stderr=stderr,
-                indistinguishable=equal,
+                effect=one.name, said=tuple(placed.sentences(chain)), parameters=placed.settings(),
+                coefficients=dict(zip(labels, placed.strength, strict=True)), stderr=errors,
+                natural=_with_errors(one, natural), evidence=one.evidence, indistinguishable=one.alternatives,
             )
         )  # fmt: skip
     return tuple(found)
 
 
+def _with_errors(one: Finding, function: Callable[[Placed], Mapping[str, float | int | str]]) -> dict[str, Size]:
+    """Return the numbers that a function makes of an effect's numbers, with standard errors to first order.
+
+    Correlations between the numbers of one effect are left out: each of what is said of an effect rests on one of them.
+    """
+    here = one.placed.numbers
+    errors = np.array([error for _, error in one.values.values()])
+    found = {name: value for name, value in function(one.placed).items() if isinstance(value, float)}
+    slopes = {name: np.zeros(len(here)) for name in found}
+    for k, error in enumerate(errors):
+        step = STEP * (error if error > 0 and np.isfinite(error) else max(abs(here[k]), STEP))
+        moved = function(one.placed.moved(here + step * np.eye(len(here))[k]))
+        for name, value in found.items():
+            there = moved.get(name)
+            slopes[name][k] = (there - value) / step if isinstance(there, float) else np.nan
+    # A number that something does not rest on says nothing of it, even if it is not known itself.
+    return {
+        name: Size(value=value, stderr=float(np.linalg.norm((slopes[name] * errors)[slopes[name] != 0])) or np.nan)
+        for name, value in found.items()
+    }
+
+
 def declared(fitted: Fitted) -> tuple[dict[str, float], dict[str, float]]:
     """Return the declared terms' coefficients and their standard errors, by the text of the term."""
     texts = fitted.model.declared.texts
-    values = fitted.solution.state.coefficients[: len(texts)]
-    errors = np.sqrt(np.maximum(np.diag(fitted.solution.covariance)[: len(texts)], 0.0))
     return (
-        {text: float(value) for text, value in zip(texts, values, strict=True)},
-        {text: float(error) for text, error in zip(texts, errors, strict=True)},
+        dict(zip(texts, map(float, fitted.model.coefficients), strict=True)),
+        dict(zip(texts, map(float, fitted.stderr[: len(texts)]), strict=True)),
     )
-
-
-def blocks(fitted: Fitted) -> list[slice]:
-    """Return which coefficients of a fit are those of each added effect."""
-    samples = fitted.data[0]
-    begin, found = len(fitted.model.declared.terms), []
-    for placed in fitted.model.effects:
-        end = begin + len(placed.forces(samples.sites, samples.is_complex))
-        found.append(slice(begin, end))
-        begin = end
-    return found
-
-
-def labels(placed: PlacedEffect, fitted: Fitted) -> list[str]:
-    """Return a text for each coefficient of an added effect."""
-    samples = fitted.data[0]
-    found = [force.label for force in placed.forces(samples.sites, samples.is_complex)]
-    # A force that is i times 1.
-    return [label.removesuffix("*1") if label.endswith("i*1") else label for label in found]
-
-
-def reading(placed: PlacedEffect, name: str, is_complex: bool) -> str:
-    """Return what a parameter of the instrument is, with the names of the file's columns."""
-    kind, _, number = name.partition("_")
-    if placed.effect.acts == "clock":
-        return f"lateness of row {number}" if kind == "row" else "slowness of the clock"
-    if is_complex and placed.effect.acts == "offset":
-        column = f"{'im' if kind == 'imaginary' else 're'}{number}"
-    elif is_complex:
-        column = f"re{number} and im{number}"
-    else:
-        column = f"u{number}" + (f" and v{number}" if placed.both else "")
-    return f"{placed.effect.acts} of {column}"

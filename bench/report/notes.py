@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.bench.report.whereabouts import scaled_residuals
-from latticebench.diagnosis.catalogued import step_of
-from latticebench.diagnosis.contest import EQUAL
+from latticebench.diagnosis.instrument import step_of
 from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
@@ -42,23 +40,14 @@ def strays(samples: Samples) -> list[str]:
 
 def notes(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return what else a reader should know, one sentence or two each."""
-    every = (
-        _of_the_readings(diagnosis),
-        _of_the_rounds(diagnosis),
-        _of_the_fits(diagnosis),
-        _of_the_names(diagnosis),
-    )
+    every = (_of_the_readings(diagnosis), _of_the_fits(diagnosis))
     return tuple(note for part in every for note in part)
 
 
 def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
-    for samples in diagnosis.course.before.data:
+    for samples in diagnosis.data:
         yield from strays(samples)
-    step = min(step_of(_parts(samples.u)) for samples in diagnosis.course.after.data)
-    share = step**2 / 12 / float(diagnosis.noise[0]) ** 2
-    if step and share > ROUNDING:
-        size = f"{100 * share:.2g} %" if share < 1 else "all"
-        yield f"The readings are multiples of {step:.4g}: rounding alone makes {size} of the noise's variance."
+    yield from _steps(diagnosis)
     used, recorded = diagnosis.used
     if used < recorded:
         yield (
@@ -67,52 +56,34 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
         )
 
 
+def _steps(diagnosis: Diagnosis) -> Iterator[str]:
+    """Yield what the steps of converters make of the noise."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for site in range(diagnosis.data[0].sites):
+        step = min(step_of(_parts(samples.u[:, site])) for samples in diagnosis.data)
+        share = step**2 / 12 / float(diagnosis.noise[site]) ** 2 if diagnosis.noise[site] > 0 else 0.0
+        if step and share > ROUNDING:
+            size = f"{100 * share:.2g} %" if share < 1 else "all"
+            found.setdefault((f"{step:.4g}", size), []).append(f"u{site + 1}")
+    for (step_, size), columns in found.items():
+        listed = "The readings" if len(columns) == diagnosis.data[0].sites else f"Readings of {', '.join(columns)}"
+        yield f"{listed} are multiples of {step_}: rounding alone makes {size} of the noise's variance."
+
+
 def _parts(field: np.ndarray) -> np.ndarray:
     """Return all readings of a field as real numbers."""
     return np.concatenate([field.real.ravel(), field.imag.ravel()]) if np.iscomplexobj(field) else field.ravel()
 
 
-def _of_the_rounds(diagnosis: Diagnosis) -> Iterator[str]:
-    course = diagnosis.course
-    kept = {placed.effect.name for placed in course.after.model.effects}
-    gone = list(dict.fromkeys(one.added for one in course.rounds if one.added and one.added not in kept))
-    if gone:
-        yield f"Added in a round and taken away again, since later ones do without: {', '.join(gone)}."
-
-
 def _of_the_fits(diagnosis: Diagnosis) -> Iterator[str]:
-    course = diagnosis.course
-    for fitted, name in ((course.before, "declared equation"), (course.after, "last model")):
-        pieces, whole = len(fitted.data), len(scaled_residuals(fitted, diagnosis))
-        if pieces > whole and (fitted is course.after or course.after.model.effects):
+    for fitted, name in ((diagnosis.before, "declared equation"), (diagnosis.after, "last model")):
+        if fitted.pieces > len(diagnosis.data) and (fitted is diagnosis.after or diagnosis.findings):
             yield (
-                f"The {name} is followed in {pieces} pieces of at most {max(len(one.t) for one in fitted.data)} "
-                "samples, each from a start of its own: over longer ones it loses the readings."
+                f"The {name} is followed in {fitted.pieces} pieces of at most {fitted.longest} samples, each from a "
+                "start of its own: over longer ones it loses the readings."
             )
-    if not course.after.solution.converged:
+    if not diagnosis.after.converged:
         yield "The last fit's steps did not end: its numbers are less sure than their standard errors say."
-    if any(len(record.stretches.dynamics.border) for record in course.after.records):
+    chain = diagnosis.after.chain
+    if len(chain.moving) < chain.sites:
         yield "The chain's ends were not declared: sites at both ends are taken as given and have no equation."
-
-
-def _of_the_names(diagnosis: Diagnosis) -> Iterator[str]:
-    course = diagnosis.course
-    unnamed = [one for one in course.left if not one.named]
-    if unnamed and course.verdict in ("unexplained", "partly explained"):
-        places = ["" if one.placed.site is None else f" (site {one.placed.site + 1})" for one in unnamed]
-        listed = ", ".join(one.name + place for one, place in zip(unnamed[:3], places, strict=False))
-        yield f"What would do most for what is left, though it is no effect of the catalogue: {listed}."
-    for name in course.repeated:
-        yield (
-            f"{name} was added more than once: a few of them can stand for any course in time, so that the name is in "
-            "doubt."
-        )
-    if course.rival is not None:
-        name, lead = course.rival
-        yield (
-            f"{name} does {'better' if lead > EQUAL else 'as well'} in the place of the last effect (by {lead:.1f}, "
-            "natural logarithms of the likelihood ratio), though it is no effect of the catalogue: the name is in "
-            "doubt."
-        )
-    if any(placed.effect.acts == "clock" for placed in course.after.model.effects):
-        yield "How late a row to come will be read cannot be known: the forecast is for the times as they are told."

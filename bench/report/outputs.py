@@ -147,7 +147,6 @@ class TrialRow(Diagnosed):
     alike: str
     right: Flag
     extra: Number
-    forecast_true: Number
     coefficients_before: Number
     coefficients_after: Number
     cpu_seconds: Number

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from latticebench.bench.provenance import lines
 from latticebench.bench.report import pictures, rows
-from latticebench.bench.report.content import Ranked, Report, Turn
+from latticebench.bench.report.content import Report
 from latticebench.bench.report.curves import PictureCurves
 from latticebench.bench.report.document import Provenance
+from latticebench.bench.report.text import INTERRUPTED
 from latticebench.systems.files import write_text
 
 if TYPE_CHECKING:
@@ -43,7 +44,9 @@ def page(report: Report, curves: PictureCurves, about: Provenance | None = None)
     return environment.get_template("diagnosis.html.j2").render(
         report=report, curves=curves, style=style, pictures=pictures.draw(curves, [float(one) for one in frequencies]),
         effects=rows.effects(report), coefficients=rows.coefficients(report), errors=rows.errors(report),
-        rounds=_rounds(report), scale=_scale(report, curves.residual.limit),
+        modes=rows.modes(report), horizons=rows.horizons(report), left=rows.left(report), tried=_bars(report),
+        alternatives=rows.alternatives(report),
+        interrupted=INTERRUPTED, scale=_scale(report, curves.residual.limit),
         swing=1 < report.recording.sites < pictures.MAPPED,
         origin=[] if about is None else [line.partition(": ")[::2] for line in lines(about.model_dump())],
     )  # fmt: skip
@@ -63,24 +66,21 @@ def _environment() -> jinja2.Environment:
     return environment
 
 
-def _rounds(report: Report) -> list[dict[str, Any]]:
-    """Return what is shown of each round; the bars of all rounds have one scale."""
-    every = [entry.evidence for turn in report.rounds for entry in turn.ranking if math.isfinite(entry.evidence)]
-    longest = max([1.0, *every])
+def _bars(report: Report) -> list[dict[str, Any]]:
+    """Return what is shown of the candidates of the last horizon: bars of their gains, and the mark of their price."""
+    shown = rows.tried(report)
+    longest = max([1.0, *(value for one in shown for value in (one.gain, one.price) if math.isfinite(value))])
+
+    def width(value: float) -> str:
+        return f"{100 * min(max(value, 0.0) / longest, 1.0):.1f}"
+
     return [
-        {"added": turn.added, "entries": [_bar(entry, turn, longest) for entry in rows.top(turn)]}
-        for turn in report.rounds
-    ]
-
-
-def _bar(entry: Ranked, turn: Turn, longest: float) -> dict[str, Any]:
-    """Return what is shown of one entry of a ranking."""
-    return {
-        "effect": entry.effect, "named": entry.named, "p": rows.chance(entry.p),
-        "kind": "chosen" if entry.effect == turn.added else "alike" if entry.effect in turn.equal else "",
-        "width": f"{100 * min(max(entry.evidence, 0.0) / longest, 1.0):.1f}",
-        "evidence": f"{entry.evidence:.{1 if abs(entry.evidence) < 100 else 0}f}",
-    }  # fmt: skip
+        {
+            "effect": one.effect, "gain": f"{one.gain:.1f}", "price": f"{one.price:.1f}", "width": width(one.gain),
+            "mark": width(one.price), "kind": "alike" if one.gain > one.price else "",
+        }
+        for one in shown
+    ]  # fmt: skip
 
 
 def _scale(report: Report, limit: float) -> dict[str, tuple[str, ...]] | None:

@@ -225,7 +225,7 @@ def growth(shown: WorstForecast) -> str:
     for one, colour, style in ((shown.before, BEFORE, "--"), (shown.after, AFTER, "-")):
         if one is None:
             continue
-        size = forecast_error(one, shown.moving, (1, 2)) / shown.noise
+        size = forecast_error(one, shown.moving, (1, 2), shown.noise)
         size = np.minimum(np.where(np.isfinite(size), size, np.nan), 1e6)
         axes.plot(*thinned(one.t, size), style, color=colour, linewidth=1.8)
         highest = max(highest, float(np.nanmax(size)) if np.any(np.isfinite(size)) else 1.0)

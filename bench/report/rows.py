@@ -4,34 +4,50 @@ from __future__ import annotations
 
 import math
 
-from latticebench.bench.report.content import Ranked, Report, Turn
+from latticebench.bench.report.content import Report
+from latticebench.bench.report.horizons import Candidate
+from latticebench.bench.report.modes import Mode
 
-# Entries of a ranking that people are shown.
-SHOWN = 6
-# So many numbers of one effect are listed.
+Table = tuple[list[str], list[list[str]]]
+
+# Candidates that people are shown.
+SHOWN = 8
+# So many numbers of one effect, and so many peaks, are listed.
 LISTED = 10
 # A forecast that is so many times as large as the readings has run away.
 DIVERGED = 1000.0
-# Parameters that only a program wants to know.
-INNER = ("open", "reach")
 
 
-def effects(report: Report) -> list[list[str]]:
+def effects(report: Report) -> Table:
     """Return effect, what, value and standard error of each number that an added effect has."""
     rows = []
     for one in report.effects:
-        numbers = {**{name: v for name, v in one.parameters.items() if name not in INNER}, **one.coefficients}
-        for name, value in list(numbers.items())[:LISTED]:
-            error = one.stderr.get(name)
-            shown = f"{value:.5g}" if isinstance(value, float) else str(value)
-            rows.append([one.effect, name, shown, "" if error is None else f"{error:.2g}"])
+        numbers = [
+            [name, f"{value:.5g}" if isinstance(value, float) else str(value), _error(one.stderr.get(name))]
+            for name, value in one.parameters.items()
+            if name not in one.natural
+        ]
+        numbers += [[name, f"{size.value:.5g}", _error(size.stderr)] for name, size in one.natural.items()]
+        rows += [[one.effect, *row] for row in numbers[:LISTED]]
         if len(numbers) > LISTED:
             rows.append([one.effect, f"... and {len(numbers) - LISTED} more, in the JSON", "", ""])
-    return rows
+    return ["effect", "what", "value", "standard error"], rows
 
 
-def coefficients(report: Report) -> tuple[list[str], list[list[str]]]:
-    """Return the declared terms with their coefficients: the heads of the columns and the rows."""
+def _error(value: float | None) -> str:
+    return "" if value is None or math.isnan(value) else f"{value:.2g}"
+
+
+def alternatives(report: Report) -> list[tuple[str, str, str]]:
+    """Return each effect with those that cannot be told from it, and one measurement that would separate them."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for one in report.separations:
+        found.setdefault((one.effect, one.measurement), []).append(one.other)
+    return [(effect, ", ".join(others), measurement) for (effect, measurement), others in found.items()]
+
+
+def coefficients(report: Report) -> Table:
+    """Return the declared terms with their coefficients."""
     columns = ["declared term", "before", "after", "standard error"]
     rows = [
         [text, f"{report.declared_before[text]:.6g}", f"{value:.6g}", f"{report.declared_stderr[text]:.2g}"]
@@ -43,7 +59,7 @@ def coefficients(report: Report) -> tuple[list[str], list[list[str]]]:
     return columns, rows
 
 
-def errors(report: Report) -> list[list[str]]:
+def errors(report: Report) -> Table:
     """Return what an error is of, and the error before and after."""
 
     def share(value: float) -> str:
@@ -54,27 +70,72 @@ def errors(report: Report) -> list[list[str]]:
     error = report.error
     rows = [
         ["residual over the noise", *(f"{one:.3g}" for one in (error.residual.before, error.residual.after))],
+        ["residual in the units of the readings", *(f"{one:.3g}" for one in (error.rms.before, error.rms.after))],
         ["share of the derivative that is left", share(error.dynamics.before), share(error.dynamics.after)],
         ["forecast error on held-out data", share(error.forecast.before), share(error.forecast.after)],
         [
             "information criterion (lower is better)",
-            *(f"{one:.1f}" for one in (error.criterion.before, error.criterion.after)),
+            *("-" if math.isnan(one) else f"{one:.1f}" for one in (error.criterion.before, error.criterion.after)),
         ],
     ]
     if error.coefficients is not None:
         both = error.coefficients
         rows.append(["error of the declared coefficients", share(both.before), share(both.after)])
-    return rows
+    return ["error", "before", "after"], rows
 
 
-def top(turn: Turn) -> list[Ranked]:
-    """Return the entries of a ranking that people are shown: the best few, with at least one that has a name."""
-    best = list(turn.ranking[:SHOWN])
-    if not any(entry.named for entry in best):
-        best += [entry for entry in turn.ranking if entry.named][:2]
-    return best
+def modes(report: Report) -> Table:
+    """Return each peak of the recording's spectrum with the nearest mode of the models, and how long that lasts.
+
+    Where the spectrum has no peaks, the modes of the last model are listed.
+    """
+    columns = ["peak of the recording", "mode before", "mode after", "decay time before", "decay time after"]
+    every, rows = report.modes, []
+    places = [one.frequency for one in every.recording] or [one.frequency for one in every.after]
+    for place in places[:LISTED]:
+        pair = [_nearest(side, place) for side in (every.before, every.after)]
+        shown = [_swing(one) for one in pair] + [_decay_time(one) for one in pair]
+        rows.append([f"{place:.5g}" if every.recording else "-", *shown])
+    if len(places) > LISTED:
+        rows.append([f"... and {len(places) - LISTED} more, in the JSON", "", "", "", ""])
+    return columns, rows
 
 
-def chance(p: float) -> str:
-    """Return a p-value as text; one too small for a number is below the smallest that there is."""
-    return f"{p:.1g}" if p > 1e-300 else "< 1e-300"
+def _nearest(modes: tuple[Mode, ...], place: float) -> Mode | None:
+    return min(modes, key=lambda one: abs(one.frequency - place), default=None)
+
+
+def _swing(one: Mode | None) -> str:
+    return "-" if one is None else f"{one.frequency:.5g}"
+
+
+def _decay_time(one: Mode | None) -> str:
+    if one is None or math.isnan(one.decay):
+        return "-"
+    if one.decay == 0:
+        return "none"
+    return f"{1 / one.decay:.4g}" if one.decay > 0 else f"grows, {-1 / one.decay:.4g}"
+
+
+def horizons(report: Report) -> Table:
+    """Return each horizon with the leading model, and how far the rivals were behind it."""
+    rows = []
+    for one in report.horizons:
+        named = [" + ".join(model.effects) or "the declared equation" for model in one.models]
+        rivals = [f"{name} ({model.behind:.1f})" for name, model in zip(named[1:], one.models[1:], strict=True)]
+        rows.append([str(one.samples), f"{one.periods:.2g}", named[0] if named else "-", "; ".join(rivals)])
+    return ["samples", "periods", "leading model", "rivals (nats behind)"], rows
+
+
+def tried(report: Report) -> list[Candidate]:
+    """Return the candidates of the last horizon that people are shown."""
+    return list(report.horizons[-1].tried[:SHOWN]) if report.horizons else []
+
+
+def left(report: Report) -> Table:
+    """Return what is significant in the last residual."""
+    rows = [
+        [one.effect, "" if one.site is None else str(one.site), f"{one.gain:.1f}", f"{one.price:.1f}"]
+        for one in report.left
+    ]
+    return ["what", "site", "gain", "price"], rows

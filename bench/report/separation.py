@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.report.document import Content
-from latticebench.systems.effects import INSTRUMENT, Acts, Effect
+from latticebench.diagnosis.acting import way_of
+from latticebench.systems.effects import CATALOGUE, Effect
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     from latticebench.diagnosis.repair import Diagnosis
+
+# What may help where nothing is known of how two effects differ.
+MORE = "a longer recording, less noise, or another initial state"
 
 
 class Separation(Content):
@@ -26,58 +30,20 @@ class Separation(Content):
 
 def separations(diagnosis: Diagnosis) -> tuple[Separation, ...]:
     """Return each added effect with each one that cannot be told from it."""
-    course = diagnosis.course
-    model, is_complex = course.after.model, course.after.data[0].is_complex
-    effects = {entry.name: entry.screened.placed.effect for one in course.rounds for entry in one.ranking}
-    effects |= {placed.effect.name: placed.effect for placed in model.effects}
-    return tuple(
-        Separation(
-            effect=placed.effect.name, other=name,
-            measurement=separation(placed.effect, effects[name], model.order, is_complex),
-        )
-        for placed, equal in zip(model.effects, course.equal, strict=True)
-        for name in equal
-    )  # fmt: skip
+    chain = diagnosis.after.chain
+    known = {one.name: one for one in (*CATALOGUE, *(found.placed.effect for found in diagnosis.findings))}
+    found = []
+    for one in diagnosis.findings:
+        for name in one.alternatives:
+            other = known.get(name)
+            said = MORE if other is None else separation(one.placed.effect, other, chain.order, chain.is_complex)
+            found.append(Separation(effect=one.name, other=name, measurement=said))
+    return tuple(found)
 
 
 def separation(one: Effect, other: Effect, order: int, is_complex: bool) -> str:
     """Return which measurement would tell two effects apart, from how they act and how their terms grow."""
-    return _by_acting(one, other) or _by_growth(one, other, order, is_complex)
-
-
-def _by_acting(one: Effect, other: Effect) -> str:
-    """Return what separates two ways of acting; nothing where both act alike."""
-    acts = {one.acts, other.acts}
-
-    def differ(*ways: Acts) -> bool:
-        return (one.acts in ways) != (other.acts in ways)
-
-    if differ(*INSTRUMENT):
-        if "clock" in acts:
-            return "a recording by a second clock: it shows the same motion, but not the same faults of time"
-        if "rounding" in acts:
-            return "a recording with a finer step: rounding goes, physics stays"
-        return (
-            "the same motion read by other sensors, or by these at other sites: a fault goes with the sensor, "
-            "physics stays with the site"
-        )
-    if differ("one site", "one equation", "offset", "gain", "every site"):
-        return "a motion that is large elsewhere in the chain: what sits at one site is felt only there"
-    if acts == {"one site", "one equation"}:
-        return (
-            "waves of other lengths: another mass answers all forces of its site differently, a defect only the one "
-            "on the site itself"
-        )
-    if acts & {"harmonic", "pulse"} and one.acts != other.acts:
-        return (
-            "another recording, begun at another time: what is driven from outside keeps its own time, whatever the "
-            "chain does"
-        )
-    if "ends" in acts:
-        return "a motion far from the ends, and one at the ends"
-    if "delayed" in acts:
-        return "a motion of other frequencies: a lag turns into another phase at each of them"
-    return ""
+    return way_of(one).separated_from(way_of(other)) or _by_growth(one, other, order, is_complex)
 
 
 def _by_growth(one: Effect, other: Effect, order: int, is_complex: bool) -> str:
@@ -94,7 +60,7 @@ def _by_growth(one: Effect, other: Effect, order: int, is_complex: bool) -> str:
         return "a recording without the input, or with another one"
     if first.reach != second.reach:
         return "waves of other lengths: what couples neighbours depends on it"
-    return "a longer recording, less noise, or another initial state"
+    return MORE
 
 
 @dataclass(frozen=True)
@@ -123,8 +89,7 @@ def _traits(effect: Effect, order: int, is_complex: bool) -> _Traits:
     ratio = ratio[np.isfinite(ratio)]
     power = round(float(np.mean(ratio)), 3) if len(ratio) and np.ptp(ratio) < 1e-6 else None
     fields = {name for name, _ in term.sites}
-    reach = max(term.reach) + (8 if effect.acts == "long range" else 0)
-    return _Traits(power, "v" in fields, "n" in term.names, "f" in fields, reach)
+    return _Traits(power, "v" in fields, "n" in term.names, "f" in fields, max(term.reach))
 
 
 def _power(power: float) -> str:

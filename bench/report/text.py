@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 from latticebench.bench.report import rows
-from latticebench.bench.report.content import Report, Turn
+from latticebench.bench.report.content import Report
 from latticebench.bench.report.screen import console, show_rows
+
+INTERRUPTED = "Interrupted: this is what was known after the last horizon."
 
 
 def show(report: Report) -> None:
     """Print a diagnosis."""
+    if report.interrupted:
+        _say(INTERRUPTED, "bold")
     _say(report.sentence, "bold")
-    _say(f"\nnoise: {report.noise:.3g}")
-    equations = [("declared", report.equation.before)]
-    if report.effects:
-        equations.append(("with what was found", report.equation.after))
-    for name, equation in equations:
-        _say(f"{name}: {equation.text}")
-        for line in equation.elsewhere:
-            _say(f"    {line}")
+    _say("\nNoise", "bold")
+    for line in report.noise_lines:
+        _say(line)
+    _show_equations(report)
     if report.effects:
         _say("\nEffects", "bold")
-        show_rows(["effect", "what", "value", "standard error"], rows.effects(report))
-    for number, turn in enumerate(report.rounds, start=1):
-        _show_round(number, turn)
-    for one in report.separations:
-        _say(f"{one.effect} cannot be told from {one.other} here. What would separate them: {one.measurement}.")
-    show_rows(["error", "before", "after"], rows.errors(report))
+        show_rows(*rows.effects(report))
+    for effect, others, measurement in rows.alternatives(report):
+        _say(f"{effect} cannot be told from {others} here. What would separate them: {measurement}.")
+    show_rows(*rows.errors(report))
     show_rows(*rows.coefficients(report))
+    _show_table("Angular frequencies", rows.modes(report))
     _say("Where the residual of the declared equation lives", "bold")
     for line in report.where.before.words:
         _say(line)
@@ -34,17 +33,35 @@ def show(report: Report) -> None:
         _say("Where the residual that is left lives", "bold")
         for line in report.where.after.words:
             _say(line)
+    _show_search(report)
     for line in report.notes:
         _say(line, "dim")
 
 
-def _show_round(number: int, turn: Turn) -> None:
-    _say(f"Round {number}: {'added ' + turn.added if turn.added else 'nothing added'}", "bold")
-    entries = [
-        [entry.effect if entry.named else f"(no name) {entry.effect}", f"{entry.evidence:.1f}", rows.chance(entry.p)]
-        for entry in rows.top(turn)
-    ]
-    show_rows(["effect", "evidence", "p"], entries)
+def _show_equations(report: Report) -> None:
+    _say("\nEquation", "bold")
+    equations = [("declared", report.equation.before)]
+    if report.effects:
+        equations.append(("with what was found", report.equation.after))
+    for name, equation in equations:
+        _say(f"{name}: {equation.text}")
+        for line in equation.elsewhere:
+            _say(f"    {line}")
+
+
+def _show_search(report: Report) -> None:
+    """Print how the search went."""
+    _show_table("\nHow the search went: longer and longer pieces were followed", rows.horizons(report))
+    candidates = [[one.effect, f"{one.gain:.1f}", f"{one.price:.1f}"] for one in rows.tried(report)]
+    _show_table("What else was tried at last, in nats", (["effect", "gain", "price"], candidates))
+    _show_table("What is left without a name, in nats", rows.left(report))
+
+
+def _show_table(title: str, table: rows.Table) -> None:
+    """Print a table under its title; nothing where it has no rows."""
+    if table[1]:
+        _say(title, "bold")
+        show_rows(*table)
 
 
 def _say(text: str, style: str = "") -> None:

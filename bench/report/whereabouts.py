@@ -12,12 +12,13 @@ import numpy as np
 import pydantic
 
 from latticebench.bench.report.document import Content
-from latticebench.diagnosis.model import Fitted
+from latticebench.diagnosis.noise import Noise, Rows
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
+    from latticebench.diagnosis.fitting import Curve, Fitted
     from latticebench.diagnosis.repair import Diagnosis
 
     Trajectory = tuple[Float[ndarray, " time"], Float[ndarray, "time levels parts sites"]]
@@ -60,28 +61,40 @@ class Whereabouts(Content):
 
 
 def scaled_residuals(fitted: Fitted, diagnosis: Diagnosis) -> list[Trajectory]:
-    """Return times and residual of each trajectory, in units of the noise and NaN where nothing was seen.
+    """Return times and residual of each trajectory, in units of the noise and NaN where nothing was seen."""
+    noise = diagnosis.after.noise
+    rest = np.reshape(diagnosis.noise, (-1, 1, diagnosis.after.chain.sites))
+    # Of Student's t the standard deviation is larger than the scale, which is what grows.
+    growth = noise.growth * float(np.nanmax(noise.deviation() / noise.size))
+    return [(one.t, (one.seen - one.level) / np.hypot(rest, growth * one.level)) for one in fitted.curves()]
 
-    Pieces that a trajectory was cut into for the fit are put together again.
+
+def _innovations(fitted: Fitted, diagnosis: Diagnosis) -> list[Trajectory]:
+    """Return what of each reading's residual does not follow from the one before, in units of what noise leaves.
+
+    Correlated noise is uncorrelated then, and outliers of heavy tails are brought in, so that the mean square is 1.
     """
-    sizes = np.asarray(diagnosis.noise)[:, None, None]
-    # What the fit took along with its parameters is missing in the residual.
-    spare = np.sqrt(max(1 - fitted.parameters / fitted.count, 0.05))
-    found: list[Trajectory] = []
-    source = ""
-    for record, samples, left in zip(fitted.records, fitted.data, fitted.residuals(), strict=True):
-        values = np.where(record.seen, left / sizes[: left.shape[1]] / spare, np.nan)
-        if found and samples.source == source and record.times[0] > found[-1][0][-1]:
-            found[-1] = (np.append(found[-1][0], record.times), np.concatenate([found[-1][1], values]))
-        else:
-            found.append((record.times, values))
-        source = samples.source
-    return found
+    noise = diagnosis.after.noise
+    # Where readings show less noise than the model leaves, the rest is no noise; of correlated noise they show a part.
+    unit = np.where(noise.memory > 0, 1.0, noise.deviation() / diagnosis.noise)
+    return [(one.t, _whitened(one, noise, unit)) for one in fitted.curves()]
+
+
+def _whitened(
+    curve: Curve, noise: Noise, unit: Float[ndarray, " sensors"]
+) -> Float[ndarray, "time levels parts sites"]:
+    rows, levels, parts, sites = curve.seen.shape
+    sensor = np.broadcast_to(np.arange(levels * sites).reshape(levels, 1, sites), (levels, parts, sites)).ravel()
+    left, level = (one.reshape(rows, -1) for one in (curve.seen - curve.level, curve.level))
+    seen = np.isfinite(left)
+    whitener = noise.whitener(level, Rows(curve.t, np.arange(rows) == 0, sensor), seen)
+    z = whitener.apply(left)
+    return np.where(seen, z * whitener.robust(z) * unit[sensor], np.nan).reshape(curve.seen.shape)
 
 
 def whereabouts(fitted: Fitted, diagnosis: Diagnosis) -> Whereabouts:
     """Return where there is more of a residual than noise of the estimated size would leave by chance."""
-    trajectories = scaled_residuals(fitted, diagnosis)
+    trajectories = _innovations(fitted, diagnosis)
     count = trajectories[0][1].shape[-1]
     sites = []
     for site in range(count):

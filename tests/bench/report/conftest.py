@@ -1,17 +1,30 @@
-"""What the tests of reports share."""
+"""What the tests of reports share: published forms, and diagnoses, made by hand and by the search."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import resources
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 
-from latticebench.bench.report.document import to_json
+from latticebench import systems
+from latticebench.bench.report.document import Provenance, to_json
 from latticebench.bench.report.schema import DOCUMENTS
+from latticebench.diagnosis.acting import Chain, Placed, way_of
+from latticebench.diagnosis.acting.everywhere import Everywhere
+from latticebench.diagnosis.acting.gain import Gain
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.noise import Noise, Structure
+from latticebench.diagnosis.repair import Diagnosis, diagnose
+from latticebench.systems.effects import CATALOGUE, Effect, find
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
 
 Conforms = Callable[[str, str], dict[str, Any]]
 
@@ -25,9 +38,192 @@ def conforms() -> Conforms:
         schema = json.loads((schemas / f"{kind}.json").read_text(encoding="utf-8"))
         found: dict[str, Any] = json.loads(text, parse_constant=pytest.fail)
         jsonschema.validate(found, schema, jsonschema.Draft202012Validator)
-        assert found["schema"] == f"latticebench/{kind}/1"
+        assert found["schema"] == DOCUMENTS[kind].model_fields["schema_"].default
         assert set(found["provenance"]) >= {"command", "commit", "date", "machine", "versions", "seeds"}
         assert to_json(DOCUMENTS[kind].model_validate_json(text)) == text
         return found
 
     return check
+
+
+@pytest.fixture(scope="session")
+def about() -> Provenance:
+    return Provenance(command="latticebench diagnose", commit="c", date="d", machine="m", versions={}, seeds=[1])
+
+
+# By the search --------------------------------------------------------------------------------------------------------
+
+Diagnosed = Callable[[str, str, float], Diagnosis]
+
+
+@pytest.fixture(scope="session")
+def diagnosed() -> Diagnosed:
+    """Diagnose a specimen of a system that lacks an effect of a given size."""
+
+    from latticebench.bench.trials.specimen import Conditions, make
+
+    def run(system: str, effect: str, z: float) -> Diagnosis:
+        studied = systems.find(system)
+        specimen = make(studied, effect, z, np.random.default_rng(3), Conditions(sites=9, samples=40))
+        declared = studied.library("equation")
+        data = [replace(specimen.samples, ends=studied.ends)]
+        return diagnose(declared, studied.order, data, CATALOGUE).against(studied.truth(declared, {}))
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def damped(diagnosed: Diagnosed) -> Diagnosis:
+    return diagnosed("phi4", "damping", 30)
+
+
+@pytest.fixture(scope="session")
+def driven(diagnosed: Diagnosed) -> Diagnosis:
+    return diagnosed("dnls", "drive", 30)
+
+
+@pytest.fixture(scope="session")
+def swing() -> Diagnosis:
+    """One pendulum, no velocities, rounded readings."""
+    from scipy.integrate import solve_ivp
+
+    t = np.arange(0, 12, 0.15)
+    u = solve_ivp(lambda _, y: [y[1], -np.sin(y[0])], (0, 12), [1.4, 0.0], t_eval=t, rtol=1e-9).y[0]
+    u = np.round(u + np.random.default_rng(2).normal(scale=0.01, size=len(t)), 2)
+    return diagnose(library("own", "sin(u[n])"), 2, [Samples(t, u[:, None], source="pendulum.csv")], CATALOGUE)
+
+
+@pytest.fixture(scope="session")
+def rough() -> Diagnosis:
+    """Two recordings, one of uneven times, both with gaps; a sensor that never answered."""
+    from latticebench.bench.trials.specimen import Conditions, make
+
+    specimen = make(systems.find("phi4"), "damping", 40, np.random.default_rng(3), Conditions(sites=9, samples=40))
+    draw = np.random.default_rng(1)
+    data = []
+    for kept in (np.arange(40), np.sort(draw.choice(40, 33, replace=False))):
+        u, v = specimen.samples.u[kept].copy(), specimen.samples.v[kept].copy()  # type: ignore[index]
+        u[draw.random(u.shape) < 0.1] = v[draw.random(v.shape) < 0.1] = np.nan
+        u[:, 3] = np.nan
+        data.append(Samples(specimen.samples.t[kept], u, v, source=f"part {len(data) + 1}.csv", ends="free"))
+    return diagnose(systems.find("phi4").library("equation"), 2, data, CATALOGUE)
+
+
+# By hand --------------------------------------------------------------------------------------------------------------
+
+OMEGA = 3.0
+
+
+def _chain_of(sites: int, order: int = 2, *, is_complex: bool = False, levels: int = 1) -> Chain:
+    """A chain with free ends, every site of which has an equation."""
+    return Chain(sites, order, is_complex, levels, "free", tuple(range(sites)), sites)
+
+
+def _noise_of(size: list[float], memory: float = 0.0, growth: float = 0.0, tail: float = np.inf) -> Noise:
+    """Noise of sensors of given sizes."""
+    return Noise(np.array(size), growth, tail, np.full(len(size), memory), Structure(own_sizes=True))
+
+
+def _forms(effect: Effect, chain: Chain) -> list[Placed]:
+    """An effect as it may stand in a model on a chain, in each of its forms, with numbers of its own."""
+    scene: Any = SimpleNamespace(
+        chain=chain, begin=0.0, span=30.0, top=4.0, frequencies=np.array([1.7234567]), inputs=True,
+        past=(lambda t: np.zeros((len(t), chain.parts, chain.sites)),), texts=("u[n+1]+u[n-1]-2*u[n]", "sin(u[n])"),
+        terms=lambda one: one.texts(chain.order, chain.is_complex),
+    )  # fmt: skip
+    kinds: dict[tuple[object, ...], Placed] = {}
+    for one in way_of(effect).places(effect, scene):
+        kinds.setdefault((type(one), len(one.numbers), one.site is None), one)
+    draw = np.random.default_rng(1)
+    return [
+        one.moved([*draw.normal(size=len(one.strength)), *one.numbers[len(one.strength) :]]) for one in kinds.values()
+    ]
+
+
+def _curve(t: np.ndarray, seen: np.ndarray, level: np.ndarray) -> Any:
+    """Readings (T, N) beside what a model reads."""
+    return SimpleNamespace(t=t, seen=seen[:, None, None], level=level[:, None, None], field=level[:, None, None])
+
+
+def _fitted(model: Model, chain: Chain, noise: Noise, curves: list[Any], **options: Any) -> Any:
+    """A fit with standard errors of a per cent of one."""
+    count = len(model.numbers)
+    about = {"converged": True, "pieces": len(curves), "longest": len(curves[0].t), "cost": 0.0, **options}
+    return SimpleNamespace(
+        model=model, chain=chain, noise=noise, covariance=1e-4 * np.eye(count), stderr=np.full(count, 0.01),
+        curves=lambda: curves, **about,
+    )  # fmt: skip
+
+
+def _finding(placed: Placed, chain: Chain, alternatives: tuple[str, ...] = (), error: float = 0.002) -> Any:
+    """A finding whose numbers are known alike."""
+    names = [*placed.labels(chain), *placed.shape]
+    values = {name: (float(value), error) for name, value in zip(names, placed.numbers, strict=True)}
+    return SimpleNamespace(
+        placed=placed, alternatives=alternatives, evidence=321.0, values=values, name=placed.effect.name,
+        site=placed.site,
+    )  # fmt: skip
+
+
+def _pendula(**changes: Any) -> Any:
+    """Two coupled pendula with a damping and a second sensor that reads 1.677 times what it should; no velocities."""
+    chain, draw = _chain_of(2), np.random.default_rng(4)
+    t = np.linspace(0, 40, 800)
+    swing = np.exp(-0.05 * t)[:, None] * np.cos(np.multiply.outer(t, [OMEGA, 1.1 * OMEGA]))
+    size = np.array([0.03, 0.02])
+    seen = swing * [1, 1.677] + size * draw.normal(size=swing.shape)
+    declared = library("own", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])")
+    damping = Everywhere(effect=find("damping"), texts=("v[n]",), strength=(-0.1,))
+    gain = Gain(effect=find("sensor-gain"), sites=(1,), both=False, strength=(0.677,))
+    noise = _noise_of([*map(float, size)])
+    before, after = Model(declared, 2, (0.9, -8.0)), Model(declared, 2, (1.0, -9.0), (damping, gain))
+    forecast = SimpleNamespace(t=t[560:], seen=seen[560:, None], error=0.8)
+    far, near = (
+        SimpleNamespace(**vars(forecast), predicted=one[560:, None]) for one in (0.5 * swing, swing * [1, 1.677])
+    )
+    peaks = [(OMEGA, np.nan), (1.1 * OMEGA, np.nan)]
+    modes = (peaks, [(0.97 * OMEGA, 0.0), (1.08 * OMEGA, 0.0)], [(OMEGA, 0.05), (1.1 * OMEGA, 0.05)])
+    tried = (("kick", 9.0), ("clock", 2.0))
+    about = {
+        "before": _fitted(before, chain, noise, [_curve(t, seen, 0.9 * swing)], pieces=40, longest=20),
+        "after": _fitted(after, chain, noise, [_curve(t, seen, swing * [1, 1.677])]),
+        "findings": (
+            _finding(damping, chain),
+            _finding(gain, chain, ("unequal-masses", "asymmetric-coupling")),
+        ),
+        "verdict": "explained",
+        "horizons": (
+            SimpleNamespace(samples=20, periods=0.5, models=((("sensor-gain",), 0.0), (("memory",), 3.2)), tried=()),
+            SimpleNamespace(
+                samples=800, periods=20.0, models=((("damping", "sensor-gain"), 0.0),),
+                tried=tuple(SimpleNamespace(name=name, gain=gain, price=7.0) for name, gain in tried),
+            ),
+        ),
+        "left": (), "data": (Samples(t, seen, source="pendula.csv", ends="free"),), "used": (800, 800),
+        "noise": size, "noise_lines": ("sensor 1: 0.03", "sensor 2: 0.02"), "residual": (15.0, 1.0),
+        "rms": (0.4, 0.025), "dynamics": (0.3, 0.02), "forecasts": ([far], [near]), "forecast": (0.8, 0.01),
+        "criterion": (0.0, -9000.0), "declared": (np.array([0.9, -8.0]), np.array([1.0, -9.0])),
+        "modes": tuple([SimpleNamespace(frequency=w, decay=d) for w, d in one] for one in modes),
+        "truth": np.array([1.0, -9.0]), "coefficients": (0.11, 0.0),
+    }  # fmt: skip
+    return SimpleNamespace(**{**about, **changes})
+
+
+@pytest.fixture(scope="session")
+def pendula() -> Callable[..., Any]:
+    return _pendula
+
+
+@pytest.fixture(scope="session")
+def forms() -> Callable[[Effect, Chain], list[Placed]]:
+    return _forms
+
+
+@pytest.fixture(scope="session")
+def chain_of() -> Callable[..., Chain]:
+    return _chain_of
+
+
+@pytest.fixture(scope="session")
+def noise_of() -> Callable[..., Noise]:
+    return _noise_of
