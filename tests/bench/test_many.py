@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -45,18 +46,24 @@ def filled(folder: Path, seeds: int) -> None:
         store.put(key_of[identity], case, result, made)
 
 
+# A process that is started counts its parent's memory as its own peak, so that a small one must start what is measured.
+STARTER = """
+import json, os, subprocess, sys
+process = subprocess.Popen(sys.argv[1:])
+_, status, usage = os.wait4(process.pid, 0)
+found = os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime, usage.ru_maxrss
+print(json.dumps(found), file=sys.stderr)
+"""
+
+
 def measured(*arguments: str, cwd: Path) -> tuple[str, float, float]:
     """Run a command; return what it prints, its processor seconds and its peak memory in MiB."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "latticebench", *arguments], cwd=cwd, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        out = process.stdout.read()
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 0
+    command = [sys.executable, "-c", STARTER, sys.executable, "-m", "latticebench", *arguments]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=True)
+    code, seconds, peak = json.loads(done.stderr.splitlines()[-1])
+    assert code == 0
     unit = 2**20 if sys.platform == "darwin" else 2**10
-    return out, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / unit
+    return done.stdout, seconds, peak / unit
 
 
 posix = pytest.mark.skipif(os.name != "posix", reason="measures as POSIX systems do")
