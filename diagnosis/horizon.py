@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 CLOSURES, CLOSED, LOST = 6, 1.0, 1e6
 # Steps with derivatives from nearby must be so many times smaller: they do not square what is left.
 CHORD = 0.1
-MOST_SUBSTEPS = 256
+# Steps of the integrator per typical interval, at most: friction that jumps would have as many as it is given.
+MOST_SUBSTEPS = 8
 # A piece of fewer rows says nothing.
 FEWEST_ROWS = 3
 # What the errors of all intervals of a piece may come to together, in units of a small size.
@@ -149,7 +150,8 @@ class Layout:
             flat = y[:, :-1].reshape(-1, y.shape[-1])
             stretches = self.stretches(number, assembled)
             needed = stretches.substeps(assembled.coefficients, flat, tolerance, self.splines[number])
-            found.append(np.minimum(needed, MOST_SUBSTEPS))
+            lasting = np.ceil((stretches.end - stretches.begin) / float(np.median(np.diff(self.records[number].times))))
+            found.append(np.minimum(needed, MOST_SUBSTEPS * np.maximum(lasting, 1).astype(int)))
         return tuple(found)
 
 
