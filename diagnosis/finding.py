@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
-from latticebench.diagnosis.search import CHANGED, Search
+from latticebench.diagnosis.search import Search, wald
 
+# An alternative that comes to no less than so many nats behind the effect is given up.
+HOPE = 30.0
 # Alternatives of an effect that are fitted in full, each of another name, and the share of its evidence that their
 # score must come to.
 MOST_ALTERNATIVES, COMPARABLE = 3, 0.5
@@ -92,7 +94,7 @@ class _Exchange:
 def _exchanged(search: Search, fitted: Fitted, number: int) -> _Exchange:
     placed = fitted.model.effects[number]
     without = search.without(fitted, number)
-    evidence = float("inf") if without is None else without.cost - fitted.cost
+    evidence = wald(fitted, number) if without is None else without.cost - fitted.cost
     models, equal = [] if without is None else [without], []
     for found in _rivals(search, fitted, without, number, evidence):
         models.append(found)
@@ -107,15 +109,17 @@ def _rivals(search: Search, fitted: Fitted, without: Fitted | None, number: int,
     placed, names = fitted.model.effects[number], set()
     for one in search.standing_in(fitted, number)[:MOST_ALTERNATIVES]:
         names.add(one.placed.effect.name)
-        plain = replace(fitted.model, effects=(*fitted.model.without(number).effects, one.placed))
-        found = search.refit(plain, fitted.layout, fitted.followed.nodes, fitted, CHANGED)
+        hope = fitted.cost + HOPE
+        found = search.exchanged(fitted, number, one.placed, hope)
+        if found is None:
+            found = search.climbed(fitted.model.without(number).with_effect(one.placed), fitted, hope)
         if found is not None:
             yield found
     if without is None:
         return
     for one in search.screened(without, timed=placed.timed):
         name = one.placed.effect.name
-        enough = one.gain > COMPARABLE * evidence or not one.placed.linear
+        enough = one.gain > COMPARABLE * evidence
         if name not in names and enough and len(names) < MOST_ALTERNATIVES and one.placed.place != placed.place:
             names.add(name)
             found = search.with_effect(without, one.placed)

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 # A fit ends where a step promises or wins fewer nats.
 ENOUGH = 0.05
+# So many first steps are taken whatever they promise: far away little can be foreseen.
+BLIND = 2
 # Damping of the first step, the factors after a step that failed and one that did not, and how often one may fail.
 DAMPING, MORE, LESS, MOST_FAILURES = 1e-6, 30.0, 0.1, 5
 # Directions of the numbers that the readings do not determine, as a share of the best determined one.
@@ -217,8 +219,9 @@ def fit(
     structure: Structure | None,
     noise: Noise | None = None,
     steps: int = 20,
+    hope: float = np.inf,
 ) -> Fitted | None:
-    """Fit a model to pieces; None where it cannot be followed.
+    """Fit a model to pieces; None where it cannot be followed or there is no hope for it.
 
     Args:
         model: with the numbers to start from.
@@ -227,6 +230,7 @@ def fit(
         structure: of the noise; chosen by the readings if None.
         noise: to start from.
         steps: largest number of Gauss-Newton steps.
+        hope: a cost; the fit is given up where the next step promises less than half of the way there.
     """
     path = follow(model, layout, near)
     followed = None if path is None else linearised(path, layout)
@@ -236,8 +240,9 @@ def fit(
     free = float(len(model.numbers) + layout.pieces * followed.size)
     noise, cost = _likely(followed, rows, free, structure, noise)
     damping, converged = DAMPING, False
-    for _ in range(steps):
-        found = _stepped(layout, followed, noise, rows, damping)
+    for step in range(steps):
+        least = (cost - hope) / 2 if step >= BLIND else 0.0
+        found = _stepped(layout, followed, noise, rows, damping, least)
         if found is None:
             converged = True
             break
@@ -246,9 +251,24 @@ def fit(
         if won < ENOUGH:
             converged = True
             break
+    if cost > hope:
+        return None
     _, error, slope, _ = whitened(followed, noise, rows)
     covariance = normal(layout, error, slope, followed.size, 0.0).covariance()
     return Fitted(layout, followed, noise, cost, covariance, converged, rows)
+
+
+def gain(won: float, error: ndarray, count: float) -> float:
+    """Return the nats that a fall of the sum of squares is worth, the size of the noise being free.
+
+    Args:
+        won: the fall, in units of the noise.
+        error: what is left, in the same units.
+        count: of readings.
+    """
+    total = float(np.sum(error**2))
+    taken = min(won, 0.999999 * total)
+    return float(-0.5 * count * np.log1p(-taken / max(total, 1e-12 * count))) if taken > 0 else 0.0
 
 
 def _likely(
@@ -260,15 +280,18 @@ def _likely(
 
 
 def _stepped(
-    layout: Layout, followed: Followed, noise: Noise, rows: Rows, damping: float
+    layout: Layout, followed: Followed, noise: Noise, rows: Rows, damping: float, least: float
 ) -> tuple[Followed, float, float] | None:
-    """Return where a step leads, the damping of the next and the nats won; None where no step wins anything."""
+    """Return where a step leads, the damping of the next and the nats won; None where none promises enough."""
     _, error, slope, _ = whitened(followed, noise, rows)
     before, size = -noise.log_likelihood(followed.left, followed.level, rows), followed.size
     for _ in range(MOST_FAILURES):
         problem = normal(layout, error, slope, size, damping)
         change = problem.step(damping)
-        if not np.all(np.isfinite(change)) or problem.promised(change) < ENOUGH / 2:
+        if not np.all(np.isfinite(change)):
+            return None
+        promised = problem.promised(change)
+        if promised < ENOUGH / 2 or gain(2 * promised, error, float(np.sum(np.isfinite(followed.left)))) < least:
             return None
         near = []
         for y, moves, inner in zip(followed.nodes, followed.moves, problem.inner, strict=True):

@@ -23,7 +23,6 @@ from latticebench.methods.engine.record import Record
 from latticebench.methods.engine.sensitivity import Stretches, Transition
 
 if TYPE_CHECKING:
-    import scipy.sparse
     from jaxtyping import Bool, Float, Int
     from numpy import ndarray
 
@@ -34,6 +33,8 @@ CLOSURES, CLOSED, LOST = 6, 1.0, 1e6
 CHORD = 0.1
 # Steps of the integrator per typical interval, at most: friction that jumps would have as many as it is given.
 MOST_SUBSTEPS = 8
+# Numbers of the states of all intervals below which the time goes into calls, not into numbers.
+SMALL_BATCH = 5000
 # A piece of fewer rows says nothing.
 FEWEST_ROWS = 3
 # What the errors of all intervals of a piece may come to together, in units of a small size.
@@ -129,6 +130,14 @@ class Layout:
             held=True,
             integrator=self.integrator,
         )
+
+    def rounds(self, number: int) -> Int[ndarray, " intervals"]:
+        """Return steps for each interval of a recording: as many for all as for one where that is quicker.
+
+        A small batch takes as long as a smaller one, and each number of steps is a batch.
+        """
+        needed = self.substeps[number]
+        return np.full_like(needed, np.max(needed)) if len(needed) * self.plain.size < SMALL_BATCH else needed
 
     def with_substeps(self, model: Model, nodes: Sequence[ndarray], top: float) -> Layout:
         """Return the same with the integrator that needs the least work near given states, and its steps."""
@@ -239,9 +248,9 @@ def linearised(path: Path, layout: Layout) -> Followed | None:
             assembled = path.model.assembled(layout.plain, layout.chain, number)
             flat = y[:, :-1].reshape(-1, y.shape[-1])
             found = layout.stretches(number, assembled).vary(
-                assembled.coefficients, flat, layout.substeps[number], layout.splines[number]
+                assembled.coefficients, flat, layout.rounds(number), layout.splines[number], dense=True
             )
-            by_state = _dense(found.by_state).reshape(*y[:, 1:].shape, y.shape[-1])
+            by_state = np.asarray(found.by_state).reshape(*y[:, 1:].shape, y.shape[-1])
             moves.append(_moves(found, by_state, assembled))
             transitions.append(by_state)
     if not all(np.all(np.isfinite(one)) for one in moves):
@@ -302,7 +311,7 @@ class _Gaps:
         for _ in range(CLOSURES):
             start = y[:, :-1].reshape(-1, y.shape[-1])
             ends = self.stretches.run(
-                self.assembled.coefficients, start, self.layout.substeps[self.number], self.layout.splines[self.number]
+                self.assembled.coefficients, start, self.layout.rounds(self.number), self.layout.splines[self.number]
             )
             y, worst = self._moved(y, ends, by_state)
             if worst < CLOSED * CHORD:
@@ -318,10 +327,10 @@ class _Gaps:
         for _ in range(CLOSURES):
             start = y[:, :-1].reshape(-1, y.shape[-1])
             found = self.stretches.vary(
-                self.assembled.coefficients, start, self.layout.substeps[self.number], self.layout.splines[self.number],
-                by_terms=False,
+                self.assembled.coefficients, start, self.layout.rounds(self.number), self.layout.splines[self.number],
+                by_terms=False, dense=True,
             )  # fmt: skip
-            y, worst = self._moved(y, found.end, _dense(found.by_state))
+            y, worst = self._moved(y, found.end, np.asarray(found.by_state))
             # Newton steps square what is left.
             if worst < CLOSED:
                 return y
@@ -337,10 +346,6 @@ class _Gaps:
         change = propagate(by_state, gaps, np.zeros((pieces, 1, size)))[:, :, 0]
         worst = float(np.max(np.abs(change) / self.units))
         return y + change, worst if np.isfinite(worst) else np.inf
-
-
-def _dense(by_state: ndarray | Sequence[scipy.sparse.csr_array]) -> ndarray:
-    return by_state if isinstance(by_state, np.ndarray) else np.stack([one.toarray() for one in by_state])
 
 
 def _moves(transition: Transition, by_state: ndarray, assembled: Assembled) -> ndarray:

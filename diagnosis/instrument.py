@@ -24,6 +24,8 @@ COARSE = 0.1
 COMB = 200
 # Steps between the first and the last of these; readings on no grid have more.
 MOST_TEETH = 5000
+# Gaps of so many steps are looked at first, where the step is known to this share.
+SMALL_GAPS, SLACK = 6.0, 0.03
 # Chance, in nats, of readings on no grid to lie as close to one as a step is allowed to be found at.
 UNLIKELY = 12.0
 # Orders of the differences that the noise is looked for in. At six readings a period each halves the signal.
@@ -93,7 +95,7 @@ def _refined(levels: Float[ndarray, " levels"], step: float, digit: float) -> fl
     allowed, kept = 0.8 * digit + 1e-3 * step, min(len(levels), COMB)
     some = _middle(levels, kept)
     teeth = float(np.ptp(some)) / step
-    if step < 1.5 * digit or teeth > MOST_TEETH:
+    if step < 1.5 * digit or teeth > MOST_TEETH or not _even(np.diff(levels), step, allowed):
         return 0.0
     # Of combs of different rates the one that passes through most levels, so many that none is passed over.
     rates = np.linspace(0.85, 1.15, 3 * round(teeth) + 10) / step
@@ -112,6 +114,12 @@ def _refined(levels: Float[ndarray, " levels"], step: float, digit: float) -> fl
         kept = min(kept + kept // 5, len(levels))
     unlikely = -len(levels) * np.log(min(2 * allowed / step, 1.0))
     return step if unlikely > UNLIKELY else 0.0
+
+
+def _even(gaps: Float[ndarray, " gaps"], step: float, allowed: float) -> bool:
+    """Return whether small gaps are multiples of about a step, as a converter's are: a first, quick look."""
+    counts = gaps[gaps < SMALL_GAPS * step] / step
+    return bool(np.all(np.abs(counts - np.round(counts)) < 2 * allowed / step + SLACK * counts))
 
 
 def _middle(levels: Float[ndarray, " levels"], kept: int) -> Float[ndarray, " kept"]:

@@ -170,6 +170,18 @@ class Whitener:
         found[self.chain.where] = z
         return np.swapaxes(found.reshape(*self.seen.T.shape, *along), 0, 1)
 
+    def transposed(self, z: Float[ndarray, "rows channels *more"]) -> Float[ndarray, "rows channels *more"]:
+        """Return the transposed map: the sum of z times `apply(x)` is that of `transposed(z)` times x."""
+        along = z.shape[2:]
+        whole = np.swapaxes(z, 0, 1).reshape(self.seen.size, -1)
+        values = whole[self.chain.where]
+        x = values * self.own[:, None]
+        if np.any(self.before):
+            x[:-1] -= values[1:] * self.before[1:, None]
+        found = np.zeros(whole.shape)
+        found[self.chain.where] = x
+        return np.swapaxes(found.reshape(*self.seen.T.shape, *along), 0, 1)
+
     def robust(self, z: Readings) -> Readings:
         """Return the square root of the weight of each innovation in a least-squares fit, 0 where nothing was seen.
 

@@ -35,7 +35,11 @@ DENSE, LONG, WINDOWS = 24, 4000, 2
 # A peak of the spectrum is motion where it stands so many times above the noise, and has this share of the largest.
 ABOVE, SHARE = 30.0, 3e-3
 # Outside influences are looked for up to so many times the highest frequency, at so many frequencies at most.
-FARTHER, MOST_FREQUENCIES = 2.5, 400
+FARTHER, MOST_FREQUENCIES = 6.0, 900
+# Multiples of its own frequencies that a motion shows where the equation or a sensor is not linear, up to this one.
+HARMONICS = 8
+# The share of the noise's variance that makes it one of rounding.
+ROUNDED = 0.5
 # A stretch that lasts so many times as long as its samples ask for holds a gap.
 GAP = 2.0
 # So many sensors are looked at for steps before it is taken that there are none.
@@ -222,6 +226,12 @@ class Problem:
         """Return the price of an effect in its place."""
         return self.price(placed.effect.name, len(placed.numbers)) + self.locked(placed)
 
+    @functools.cached_property
+    def _rounded(self) -> bool:
+        """Whether rounding makes most of the noise; of a regular motion it leaves lines at high multiples."""
+        pairs = zip(self.steps, self.noise, strict=False)
+        return any(step**2 / 12 > ROUNDED * size**2 for step, size in pairs)
+
     def locked(self, placed: Placed) -> float:
         """Return what an influence costs besides that swings as the motion itself does."""
         if placed.effect.name in rules.FED:
@@ -229,20 +239,22 @@ class Problem:
         omega = placed.frequency
         if omega is None:
             return 0.0
+        if self._rounded:
+            return rules.LOCKED
         width = 4 * np.pi / float(self.data[0].t[-1] - self.data[0].t[0])
         own = self.spectrum.peaks[:4]
-        sums = np.abs(
-            np.concatenate([own, 2 * own, np.add.outer(own, own).ravel(), np.subtract.outer(own, own).ravel()])
-        )
+        multiples = np.multiply.outer(np.arange(1, HARMONICS), own).ravel()
+        sums = np.abs([*multiples, *np.add.outer(own, own).ravel(), *np.subtract.outer(own, own).ravel()])
         sums = sums[sums > width]
         return rules.LOCKED if np.any(np.abs(sums - abs(omega)) < width) else 0.0
 
 
 @functools.lru_cache(maxsize=4096)
 def _isf(share: float, numbers: int) -> float:
-    from scipy import stats
+    from scipy.special import gammainccinv
 
-    return float(stats.chi2.isf(share, numbers)) / 2
+    # Twice the nats follow chi-squared.
+    return float(gammainccinv(numbers / 2, share))
 
 
 def _top(spectrum: Spectrum, samples: Samples) -> float:

@@ -182,7 +182,9 @@ def _named(search: Search, found: Found, held_out: Sequence[Samples]) -> Compare
     search.say("trying what could stand in the place of each effect")
     best = compared(search, found.models[0])
     before, now = (pooled(predict(one, search.problem, held_out)) for one in (found.before, best.fitted))
-    while best.fitted.model.effects and now > (1 + rules.WORSE) * before:
+    of_u = best.fitted.rms[: search.problem.chain.sites]
+    least = rules.BEYOND_NOISE * float(np.sqrt(np.nanmean(of_u**2))) / search.problem.height
+    while best.fitted.model.effects and now > max((1 + rules.WORSE) * before, least):
         search.say("the forecast is worse than before: trying without the weakest effect")
         weakest = int(np.argmin(best.evidence))
         fitted = search.without(best.fitted, weakest)

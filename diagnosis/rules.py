@@ -9,13 +9,13 @@ FALSE_ALARM = 0.005
 # Chance that such a diagnosis finds something without a name.
 FALSE_DOUBT = 0.005
 # Nats that an effect must bring besides if it is a stand-in for many others: a priori it is less often what is missing.
-STAND_IN = 5.0
+STAND_IN = 8.0
 STAND_INS = frozenset({
     "gradient", "trap", "asymmetric-coupling", "memory", "parametric-drive", "kick", "sensor-curve", "long-range",
     "disorder", "clock", "onsite-quintic", "gain-loss",
 })  # fmt: skip
-# Nats besides for an influence that swings at a frequency, or twice or half one, of the motion itself: a wrong equation
-# leaves just that.
+# Nats besides for an influence that swings at a frequency of the motion itself, a multiple or a sum: a wrong equation
+# leaves just that. Where rounding makes the noise, it leaves lines at any frequency.
 LOCKED = 30.0
 # Effects that feed readings back into the motion: what they bring is such an influence, too.
 FED = frozenset({"memory"})
@@ -23,6 +23,8 @@ FED = frozenset({"memory"})
 RIVALS, BEHIND = 3, 60.0
 # Candidates of each model that are fitted in full, those of the highest score first.
 TRIED = 4
+# A score is linear: a candidate may bring so many times what its score says.
+UNDERSTATED = 2.0
 # Effects in a model, at most.
 MOST_EFFECTS = 8
 # Effects that come within so many nats of the one that is named cannot be told from it by these readings.
@@ -32,10 +34,17 @@ EQUAL = 3.0
 PERIODS = 3.0
 # Horizons begin at this share of the shortest period, where a wrong equation can follow, too.
 FIRST_HORIZON = 0.5
+# Pieces grow so many times from one horizon to the next, and faster where that changed nothing; beyond this share of
+# the record they are the record.
+GROWTH, FASTER, ALMOST = 2, 4, 0.6
+# Periods of the longest pieces where the ends are unknown: the outer sites are taken as read, so that their noise
+# drives their neighbours, the more the longer a piece is.
+BORDER = 1.0
 # A residual beyond so many times the noise that the readings themselves show is not followed.
 LOST = 3.0
 # Nats that a chain costs in which neighbours push each other away. In a linear chain of two it is the mirror image of
 # one whose second sensor looks from the other side; of the two, that is what laboratories have.
 REPELLING = 30.0
-# A forecast is worse where its error grows by more than this share of itself.
-WORSE = 0.05
+# A forecast is worse where its error grows by more than this share of itself and is more than so many times the noise:
+# with fewer readings every number more costs a little.
+WORSE, BEYOND_NOISE = 0.05, 2.0

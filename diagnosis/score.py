@@ -7,23 +7,30 @@ integration (Rao's score test; nuisance parameters are projected out).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.acting import Placed
-from latticebench.diagnosis.fitting import Fitted, by_pieces, normal, scaled_inverse, whitened
+from latticebench.diagnosis.acting import Force, Placed
+from latticebench.diagnosis.fitting import Fitted, by_pieces, gain, normal, scaled_inverse, whitened
 from latticebench.diagnosis.horizon import fields, propagate
-from latticebench.diagnosis.model import Assembled, read_term
+from latticebench.diagnosis.model import Assembled, Model, read_term
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
+    from latticebench.methods.engine.dynamics import Dynamics
+    from latticebench.systems.terms import Term
+
 # Numbers that are worked on at a time.
-CHUNK = 4_000_000
+CHUNK = 8_000_000
+# Random directions of readings that a force's curvature is estimated from, directions of its numbers that are one, and
+# candidates of a kind whose score is then computed.
+DIRECTIONS, ALIKE, LIKELIEST = 24, 1e-3, 12
 # Directions that the model can do already, as a share of what a candidate does.
 OLD = 1e-4
 
@@ -69,6 +76,21 @@ class _Along:
     late: ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class _Responses:
+    """What the numbers of candidates do to the readings, in units of their noise.
+
+    Attributes:
+        of: which candidates.
+        whole: sizes of all they do.
+        columns: of it, what initial states cannot do (readings, numbers).
+    """
+
+    of: tuple[int, ...]
+    whole: ndarray
+    columns: ndarray
+
+
 class Tangent:
     """A fit with what unit forces at each site would do."""
 
@@ -77,10 +99,10 @@ class Tangent:
         layout, followed = fitted.layout, fitted.followed
         self.whitener, self.error, slope, self.robust = whitened(followed, fitted.noise, fitted.rows)
         self.along = [self._along(number) for number in range(len(layout.records))]
-        solved = normal(layout, self.error, slope, followed.size, 0.0)
+        self.solved = normal(layout, self.error, slope, followed.size, 0.0)
         size, left, free = followed.size, [], []
         self.local, self.inverse = [], []
-        for by, error, inner in zip(solved.slope, solved.error, solved.inner, strict=True):
+        for by, error, inner in zip(self.solved.slope, self.solved.error, self.solved.inner, strict=True):
             local = by[:, :, :size]
             unit, divided = scaled_inverse(np.swapaxes(local, 1, 2) @ local, 0.0)
             self.local.append(local)
@@ -89,7 +111,10 @@ class Tangent:
             left.append((error - (local @ inner[:, :, -1:])[..., 0]).ravel())
         self.left, self.free = np.concatenate(left), np.concatenate(free)
         self.basis = _orthonormal(self.free)
+        self._kept: _Responses | None = None
+        self.courses: dict[tuple[int, str, bytes], ndarray] = {}
         self.terms: dict[tuple[int, str], ndarray] = {}
+        self.evaluators: dict[tuple[int, tuple[int, int]], Callable[[Term], ndarray]] = {}
 
     def _along(self, number: int) -> _Along:
         layout, followed = self.fitted.layout, self.fitted.followed
@@ -113,7 +138,7 @@ class Tangent:
         pieces, m, size = y.shape
         stretches = replace(layout.stretches(number, assembled), dynamics=wide)
         flat = y[:, :-1].reshape(-1, size)
-        found = stretches.vary(coefficients, flat, layout.substeps[number], layout.splines[number])
+        found = stretches.vary(coefficients, flat, layout.rounds(number), layout.splines[number], dense=True)
         unit = found.by_coefficient[:, len(dynamics.terms) :]
         unit = unit.reshape(pieces, m - 1, chain.parts, 2, len(chain.moving), size)
         t = record.times[rows]
@@ -132,17 +157,103 @@ class Tangent:
         count = 0
         for instrument in (False, True):
             for one in candidates:
-                if one.instrument is instrument and one.linear:
+                if one.instrument is instrument:
                     batch.append(one)
-                    count += len(one.numbers)
+                    count += _columns_of(one)
                 if count * self.error.size > CHUNK:
                     found, batch, count = found + self._scored(batch), [], 0
         return found + (self._scored(batch) if batch else [])
 
+    def likeliest(
+        self, candidates: Sequence[Placed], price: Callable[[Placed], float], kind: Callable[[Placed], object]
+    ) -> list[Placed]:
+        """Return the few candidates of each kind that are likely to win most beyond their price."""
+        gains = self._glanced(candidates)
+        ranked = sorted(zip(gains, candidates, strict=True), key=lambda pair: price(pair[1]) - pair[0])
+        kept: dict[object, list[Placed]] = {}
+        for _, one in ranked:
+            kept.setdefault(kind(one), []).append(one)
+        return [one for few in kept.values() for one in few[:LIKELIEST]]
+
+    def _glanced(self, candidates: Sequence[Placed]) -> list[float]:
+        """Return about how many nats forces would win, without what each of them would do to the readings.
+
+        The slope of the likelihood by a force follows from its adjoint. Its curvature is a mean square over random
+        directions in the space of readings (Hutchinson, Commun. Stat. Simul. Comput. 18, 1059 (1989)).
+        """
+        found = []
+        for one in candidates:
+            by = np.zeros((_columns_of(one), 1 + DIRECTIONS))
+            for number in range(len(self.along)):
+                by += self._pulled(number, one)
+            size = np.linalg.norm(by[:, 1:], axis=1, keepdims=True)
+            scaled = by / np.where(size > 0, size, 1.0)
+            u, values, _ = np.linalg.svd(scaled[:, 1:], full_matrices=False)
+            held = values > ALIKE
+            found.append(self._gain(float(DIRECTIONS * np.sum((u[:, held].T @ scaled[:, 0] / values[held]) ** 2))))
+        return found
+
+    def _pulled(self, number: int, one: Placed) -> ndarray:
+        """Return derivatives of what is left, and of random directions, by the numbers of an effect: (., 1 + D)."""
+        along, dual, found = self.along[number], self._duals[number], np.zeros((_columns_of(one), 1 + DIRECTIONS))
+        if one.scaled() is not None or one.other_ends() is not None:
+            return np.asarray(self._push(number, one).reshape(len(found), -1) @ dual)
+        for force in one.forces(self.fitted.chain):
+            factor = force.factor_of(number)
+            course = np.ones((1, len(along.t), 1)) if factor is None else factor(along.t)
+            if course.shape[0] * course.shape[2] > 1:
+                return np.asarray(self._push(number, one).reshape(len(found), -1) @ dual)
+            value = course[0, :, 0] @ self._in_time(number, force)
+            for k, share in force.by.items():
+                found[k] += share * value
+        return found
+
+    def _in_time(self, number: int, force: Force) -> ndarray:
+        """Return derivatives by a force's factor at each time: (rows, 1 + D)."""
+        key = number, force.text, b"" if force.weights is None else force.weights.tobytes()
+        if key not in self.courses:
+            values, chain = self._term(number, force.text), self.fitted.chain
+            if force.weights is not None:
+                values = values * force.weights[list(chain.moving)]
+            dual = self._duals[number].reshape(*values.shape, -1)
+            self.courses[key] = np.einsum("rqn,rqnk->rk", values, dual)
+        return self.courses[key]
+
+    @functools.cached_property
+    def _duals(self) -> list[ndarray]:
+        """Derivatives of what is left, and of random directions, by forces in each recording: (rows parts M, 1 + D)."""
+        layout, shape = self.fitted.layout, self.error.shape
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (*shape, DIRECTIONS))
+        looked = np.concatenate([self.left[:, None], self._new(by_pieces(layout, signs))], axis=1)
+        readings = self.whitener.transposed(looked.reshape(*shape, -1) * self.robust[..., None])
+        found, begin = [], 0
+        for number, rows in enumerate(layout.rows):
+            part = readings[begin : begin + rows.size] * self._own(number)[..., None]
+            begin += rows.size
+            found.append(self._dual(number, part))
+        return found
+
+    def _dual(self, number: int, readings: ndarray) -> ndarray:
+        """Return derivatives by forces from those by the readings' fields (rows, channels, 1 + D)."""
+        layout, along, chain = self.fitted.layout, self.along[number], self.fitted.chain
+        pieces, m = layout.rows[number].shape
+        count = readings.shape[-1]
+        fields = readings.reshape(pieces, m, chain.levels, chain.parts, chain.sites, count)[..., layout.plain.moving, :]
+        by_state = np.zeros((pieces, m, count, chain.order, *fields.shape[3:5]))
+        by_state[:, :, :, : chain.levels] = np.moveaxis(fields, -1, 2)
+        by_state = by_state.reshape(pieces, m, count, -1)
+        back = np.swapaxes(self.fitted.followed.transitions[number][:, ::-1], 2, 3)
+        carried = propagate(back, by_state[:, -2::-1], by_state[:, -1])[:, ::-1]
+        dual = np.zeros((pieces, m, chain.parts, len(chain.moving), count))
+        dual[:, :-1] += np.einsum("pjqns,pjks->pjqnk", along.early, carried[:, 1:], optimize=True)
+        dual[:, 1:] += np.einsum("pjqns,pjks->pjqnk", along.late, carried[:, 1:], optimize=True)
+        return dual.reshape(-1, count)
+
     def standing_in(self, number: int, candidates: Sequence[Placed]) -> list[Scored]:
         """Return candidates with the share of what one effect of the model does that they could do in its place.
 
-        The share takes the place of the gain; their numbers are those with which they do it.
+        The share takes the place of the gain; it is above 1 for what would do more. Their numbers are those with which
+        they do it.
         """
         placed, block = self.fitted.model.effects[number], self.fitted.model.blocks[number]
         strength = slice(block.start, block.start + len(placed.strength))
@@ -150,89 +261,141 @@ class Tangent:
         left, basis = self.left, self.basis
         self.basis = _orthonormal(others)
         done = self.free[:, strength] @ np.array(placed.strength)
-        self.left = done - self.basis @ (self.basis.T @ done)
+        own = done - self.basis @ (self.basis.T @ done)
+        whole = float(own @ own)
+        self.left = own + left
         found = self.scored(candidates)
-        whole = float(self.left @ self.left)
         self.left, self.basis = left, basis
         return [replace(one, gain=one.won / whole if whole > 0 else 0.0) for one in found]
 
-    def columns(self, batch: Sequence[Placed]) -> Float[ndarray, "readings numbers"]:
-        """Return what the numbers of effects do to the readings that nothing in the model does; forces first."""
-        pieces = by_pieces(self.fitted.layout, self._whitened(batch))
-        return self._new(pieces)
+    def start(self, placed: Placed, dropped: int | None = None) -> tuple[Model, list[Float[ndarray, "pieces m state"]]]:
+        """Return a model with one more effect and states near its motion, to first order in the effect's strengths.
+
+        Args:
+            placed: the effect with its numbers.
+            dropped: the number of an effect of the model that it takes the place of.
+        """
+        model, layout = self.fitted.model, self.fitted.layout
+        change, kept = np.zeros(self.free.shape[1]), np.ones(self.free.shape[1], dtype=bool)
+        if dropped is not None:
+            block, gone = model.blocks[dropped], model.effects[dropped].strength
+            kept[block] = False
+            change[block.start : block.start + len(gone)] = -np.array(gone)
+        own = np.concatenate([placed.strength, np.zeros(len(placed.shape))]) if len(placed.numbers) else np.ones(1)
+        pushed = [column @ own for column in by_pieces(layout, self._whitened([placed]))]
+        target = self.left - self.free @ change - self._moving_on([one[..., None] for one in pushed])[:, 0]
+        others = self.free[:, kept]
+        size = np.linalg.norm(others, axis=0)
+        size[size == 0] = 1.0
+        change[kept] += np.linalg.lstsq(others / size, target, rcond=1e-5)[0] / size
+        near = []
+        for number, (local, inverse, push) in enumerate(zip(self.local, self.inverse, pushed, strict=True)):
+            error = self.solved.error[number] - self.solved.slope[number][:, :, local.shape[2] :] @ change - push
+            states = (inverse @ _across(local, error)[..., None])[..., 0]
+            varied = np.concatenate([states, np.broadcast_to(change, (len(states), len(change)))], axis=1)
+            nodes, moves = self.fitted.followed.nodes[number], self.fitted.followed.moves[number]
+            near.append(nodes + (varied[:, None, None] @ moves)[:, :, 0])
+            if not placed.instrument:
+                near[-1] += (own @ self._moved(number, [placed])).reshape(nodes.shape)
+        moved = model.moved(model.numbers + change)
+        return (moved if dropped is None else moved.without(dropped)).with_effect(placed), near
 
     def _whitened(self, batch: Sequence[Placed]) -> ndarray:
         flat = np.concatenate([self._columns(k, batch) for k in range(len(self.along))])
         return np.asarray(self.whitener.apply(flat) * self.robust[..., None])
 
+    def _responses(self, batch: Sequence[Placed]) -> _Responses:
+        """Return what numbers of effects do to the readings; those of the last candidates are kept."""
+        known = tuple(id(one) for one in batch)
+        if self._kept is None or self._kept.of != known:
+            flat = self._whitened(batch)
+            whole = np.linalg.norm(flat.reshape(-1, flat.shape[-1]), axis=0)
+            self._kept = _Responses(known, whole, self._moving_on(by_pieces(self.fitted.layout, flat)))
+        return self._kept
+
+    def _moving_on(self, pieces: Sequence[ndarray]) -> ndarray:
+        """Return what columns do to the readings that initial states cannot do."""
+        parts = zip(pieces, self.local, self.inverse, strict=True)
+        found = [one - local @ (inverse @ (np.swapaxes(local, 1, 2) @ one)) for one, local, inverse in parts]
+        return np.concatenate([one.reshape(-1, one.shape[-1]) for one in found])
+
     def _new(self, pieces: Sequence[ndarray]) -> ndarray:
-        found = []
-        for column, local, inverse in zip(pieces, self.local, self.inverse, strict=True):
-            found.append(
-                (column - local @ (inverse @ (np.swapaxes(local, 1, 2) @ column))).reshape(-1, column.shape[-1])
-            )
-        new = np.concatenate(found)
+        """Return what columns do to the readings that nothing in the model can do."""
+        new = self._moving_on(pieces)
         return np.asarray(new - self.basis @ (self.basis.T @ new))
 
     def _scored(self, batch: Sequence[Placed]) -> list[Scored]:
-        flat = self._whitened(batch)
-        whole = np.linalg.norm(flat.reshape(-1, flat.shape[-1]), axis=0)
-        new = self._new(by_pieces(self.fitted.layout, flat))
-        total, count = float(np.sum(self.error**2)), float(np.sum(np.isfinite(self.fitted.followed.left)))
+        seen = self._responses(batch)
+        unit = np.where(seen.whole > 0, seen.whole, 1.0)
+        shared = (self.basis.T @ seen.columns) / unit
+        slopes = (seen.columns.T @ self.left) / unit - shared.T @ (self.basis.T @ self.left)
         found, begin = [], 0
         for one in batch:
-            block = slice(begin, begin + len(one.numbers))
+            block = slice(begin, begin + _columns_of(one))
             begin = block.stop
-            unit = np.where(whole[block] > 0, whole[block], 1.0)
-            u, values, vt = np.linalg.svd(new[:, block] / unit, full_matrices=False)
-            held = values > OLD
-            projected = u[:, held].T @ self.left
-            numbers = (vt[held].T @ (projected / values[held])) / unit
-            won = float(projected @ projected)
+            part = seen.columns[:, block] / unit[block]
+            curved = part.T @ part - shared[:, block].T @ shared[:, block]
+            if not len(one.numbers):
+                won = float((2 * slopes[block] * unit[block] - np.diag(curved) * unit[block] ** 2)[0])
+                found.append(Scored(one, self._gain(won), 1, won))
+                continue
+            values, vectors = np.linalg.eigh(curved)
+            held = values > OLD**2
+            projected = vectors[:, held].T @ slopes[block]
+            numbers = (vectors[:, held] @ (projected / values[held])) / unit[block]
+            won = float(np.sum(projected**2 / values[held]))
             if one.effect.takes and numbers[0] > 0:
                 won = 0.0
-            taken = min(won, 0.999999 * total)
-            gain = -0.5 * count * np.log1p(-taken / max(total, 1e-12 * count)) if taken > 0 else 0.0
-            found.append(Scored(one.moved(one.numbers + numbers), float(gain), int(np.sum(held)), won))
+            found.append(Scored(one.moved(one.numbers + numbers), self._gain(won), int(np.sum(held)), won))
         return found
+
+    def _gain(self, won: float) -> float:
+        """Return the nats that so much of the sum of squares is worth, the size of the noise being free."""
+        return gain(won, self.error, float(np.sum(np.isfinite(self.fitted.followed.left))))
 
     def _columns(self, number: int, batch: Sequence[Placed]) -> ndarray:
         """Return what the numbers of effects do to the readings of one recording: (rows, channels, numbers)."""
         layout, along = self.fitted.layout, self.along[number]
         chain, rows = layout.chain, layout.rows[number]
         blocks = []
-        pushes = [self._push(number, one) for one in batch if not one.instrument]
-        if pushes:
-            push = np.concatenate(pushes).reshape(-1, *rows.shape, chain.parts, len(chain.moving))
-            forced = np.einsum("cpjqn,pjqns->pjcs", push[:, :, :-1], along.early, optimize=True)
-            forced += np.einsum("cpjqn,pjqns->pjcs", push[:, :, 1:], along.late, optimize=True)
-            still = np.zeros((rows.shape[0], len(push), along.states.shape[1]))
-            z = propagate(self.fitted.followed.transitions[number], forced, still).reshape(rows.size, len(push), -1)
+        forces = [one for one in batch if not one.instrument]
+        if forces:
+            z = self._moved(number, forces)
             field = np.moveaxis(layout.plain.whole(z, None)[:, :, : chain.levels], 1, -1)
-            blocks.append(field.reshape(rows.size, -1, len(push)) * self._own(number)[..., None])
+            blocks.append(field.reshape(rows.size, -1, z.shape[1]) * self._own(number)[..., None])
         for one in batch:
             if one.instrument:
                 by = one.misread(along.t, along.field, along.rate).by
                 blocks.append(np.moveaxis(by.reshape(len(by), rows.size, -1), 0, -1))
         return np.concatenate(blocks, axis=-1)
 
+    def _moved(self, number: int, forces: Sequence[Placed]) -> ndarray:
+        """Return what the numbers of forces do to the states of one recording: (rows, numbers, S)."""
+        layout, along = self.fitted.layout, self.along[number]
+        chain, rows = layout.chain, layout.rows[number]
+        pushes = [self._push(number, one) for one in forces]
+        push = np.concatenate(pushes).reshape(-1, *rows.shape, chain.parts, len(chain.moving))
+        forced = np.einsum("cpjqn,pjqns->pjcs", push[:, :, :-1], along.early, optimize=True)
+        forced += np.einsum("cpjqn,pjqns->pjcs", push[:, :, 1:], along.late, optimize=True)
+        still = np.zeros((rows.shape[0], len(push), along.states.shape[1]))
+        z = propagate(self.fitted.followed.transitions[number], forced, still)
+        return z.reshape(rows.size, len(push), -1)
+
     def _own(self, number: int) -> ndarray:
         begin = sum(rows.size for rows in self.fitted.layout.rows[:number])
         return self.fitted.followed.own[begin : begin + self.fitted.layout.rows[number].size]
 
     def _push(self, number: int, one: Placed) -> ndarray:
-        """Return the forces of an effect's numbers along the motion: (numbers, rows, parts, M)."""
+        """Return the forces of an effect's numbers, or of one without any, along the motion: (., rows, parts, M)."""
         layout, along = self.fitted.layout, self.along[number]
         chain, dynamics = layout.chain, along.assembled.dynamics
-        push = np.zeros((len(one.numbers), len(along.t), chain.parts, len(chain.moving)))
-        site = one.scaled()
+        push = np.zeros((_columns_of(one), len(along.t), chain.parts, len(chain.moving)))
+        site, ends = one.scaled(), one.other_ends()
         if site is not None:
-            f = self._input(number)
-            rate = dynamics.linear(
-                along.assembled.coefficients, along.t, along.states, f, along.driven, derivatives=False
-            )[0]  # fmt: skip
             index = chain.moving.index(site)
-            push[0, :, :, index] = rate.reshape(len(along.t), chain.order, chain.parts, -1)[:, -1, :, index]
+            push[0, :, :, index] = self._rate(number, dynamics)[..., index]
+        if ends is not None:
+            push[0] = self._rate(number, replace(dynamics, ends=ends)) - self._rate(number, dynamics)
         for force in one.forces(chain):
             values = self._term(number, force.text)
             if force.weights is not None:
@@ -245,6 +408,14 @@ class Tangent:
                 push[k] += value * values
         return push
 
+    def _rate(self, number: int, dynamics: Dynamics) -> ndarray:
+        """Return the highest time derivative that an equation gives along the motion: (rows, parts, M)."""
+        along, chain = self.along[number], self.fitted.chain
+        rate = dynamics.linear(
+            along.assembled.coefficients, along.t, along.states, self._input(number), along.driven, derivatives=False
+        )[0]
+        return np.asarray(rate.reshape(len(along.t), chain.order, chain.parts, -1)[:, -1])
+
     def _input(self, number: int) -> ndarray | None:
         inputs = self.fitted.layout.records[number].stretches.inputs
         return None if inputs is None else inputs(self.along[number].t)
@@ -252,14 +423,29 @@ class Tangent:
     def _term(self, number: int, text: str) -> ndarray:
         """Return the values of a term along the motion: (rows, parts, M)."""
         if (number, text) not in self.terms:
+            term = read_term(text)
+            self.terms[number, text] = self._evaluator(number, term.reach)(term)
+        return self.terms[number, text]
+
+    def _evaluator(self, number: int, reach: tuple[int, int]) -> Callable[[Term], ndarray]:
+        """Return what evaluates terms of a reach along the motion."""
+        if (number, reach) not in self.evaluators:
             along = self.along[number]
             base = along.assembled.dynamics
-            alone = replace(base, terms=(read_term(text),), weights=None, factors=None, least_reach=base.reach)
-            values = alone.linear(
-                np.zeros(1), along.t, along.states, self._input(number), along.driven, derivatives=False
-            )[1]  # fmt: skip
-            self.terms[number, text] = np.moveaxis(values[:, 0], 0, 1)
-        return self.terms[number, text]
+            left, right = (max(pair) for pair in zip(base.reach, reach, strict=True))
+            wide = replace(base, least_reach=(left, right))
+            self.evaluators[number, reach] = wide.evaluator(along.t, along.states, self._input(number), along.driven)
+        return self.evaluators[number, reach]
+
+
+def _across(local: ndarray, readings: ndarray) -> ndarray:
+    """Return the products of readings (pieces, R) with what states do to them (pieces, R, S)."""
+    return np.asarray((np.swapaxes(local, 1, 2) @ readings[..., None])[..., 0])
+
+
+def _columns_of(one: Placed) -> int:
+    """Return how many columns an effect has: one per number, or one for what it does without any."""
+    return max(len(one.numbers), 1)
 
 
 def _orthonormal(columns: Float[ndarray, "readings numbers"]) -> Float[ndarray, "readings held"]:

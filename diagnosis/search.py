@@ -29,12 +29,12 @@ ROWS, PIECES = 1200, 4
 SMALL_SHARE, SMALL_NOISE = 1e-3, 0.1
 # Gauss-Newton steps of a first fit, of one at the next horizon, and of one with an effect more or less.
 FIRST, CARRIED, CHANGED = 40, 25, 10
+# A model that cannot be followed over long pieces at once begins on the second horizon and climbs so many at a time.
+CLIMBING = 2
 # Models whose costs and readings differ by less (nats; share of the noise) are one model said in two ways.
 SAME_COST, SAME_READING = 0.3, 0.05
 # An effect is tried without where its own uncertainty leaves less than so many nats beyond its price.
 DOUBT = 8.0
-# Pieces grow twofold up to so many of the shortest periods, and faster beyond.
-SLOWLY, TWICE, THRICE = 8, 2, 3
 
 # A candidate may take the place of an effect if it can do this share of what the effect does.
 MOST_OF_IT = 0.9
@@ -101,6 +101,8 @@ class Search:
         self.small = SMALL_SHARE * problem.height
         self.tried: dict[tuple[str, ...], tuple[Tried, ...]] = {}
         self.open: tuple[Placed, ...] = problem.candidates
+        self.lengths: list[int] = []
+        self._last: Tangent | None = None
 
     def value(self, fitted: Fitted) -> float:
         """Return the cost of a fit with the prices of its effects and of the noise's parameters, in nats."""
@@ -120,8 +122,11 @@ class Search:
         """Yield what was found on each horizon, from short pieces to whole recordings."""
         done: tuple[Horizon, ...] = ()
         last: Found | None = None
-        for length in self._lengths():
-            whole = length >= max(len(one.t) for one in self.problem.data)
+        shortest = 2 * np.pi / self.problem.top / self.problem.step
+        length = max(int(rules.FIRST_HORIZON * shortest), self._least)
+        while length:
+            self.lengths.append(length)
+            whole = length >= self._longest
             waves = length * self.problem.step * self.problem.main / (2 * np.pi)
             late = whole or waves >= rules.PERIODS or (last is not None and self.lost(last.models[0]))
             self.open = tuple(one for one in self.problem.candidates if late or not one.timed)
@@ -134,25 +139,37 @@ class Search:
             base = self.value(best[0])
             models = tuple((_names(one.model), self.value(one) - base) for one in best)
             done = (*done, Horizon(best[0].longest, waves, models, self.tried.get(best[0].model.key, ())))
+            settled = last is not None and last.models[0].model.key == best[0].model.key
             last = Found(before, tuple(best), done)
             yield last
+            length = self._next(length, settled)
 
     def lost(self, fitted: Fitted) -> bool:
         """Return whether a model leaves much more of the readings than their own noise."""
         noise = self.problem.noise
         return bool(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0) > rules.LOST)
 
-    def _lengths(self) -> list[int]:
-        """Return the lengths of pieces, in rows."""
-        problem, found = self.problem, []
-        longest = max(len(one.t) for one in problem.data)
-        shortest = 2 * np.pi / problem.top / problem.step
-        least = 2 * problem.chain.order // problem.chain.levels + 2
-        length = max(int(rules.FIRST_HORIZON * shortest), least)
-        while length < 0.6 * longest:
-            found.append(length)
-            length *= TWICE if length < SLOWLY * shortest else THRICE
-        return [*found, longest]
+    @property
+    def _least(self) -> int:
+        """The fewest rows of a piece that say something."""
+        return 2 * self.problem.chain.order // self.problem.chain.levels + 2
+
+    @property
+    def _longest(self) -> int:
+        """The rows of the longest pieces: whole recordings, or a few periods where noise comes in from the border."""
+        longest = max(len(one.t) for one in self.problem.data)
+        if not len(self.problem.plain.border):
+            return longest
+        period = 2 * np.pi / self.problem.main / self.problem.step
+        return min(longest, max(round(rules.BORDER * period), self._least))
+
+    def _next(self, length: int, settled: bool) -> int:
+        """Return the rows of the pieces of the next horizon; 0 after the longest."""
+        longest = self._longest
+        if length >= longest:
+            return 0
+        further = length * (rules.FASTER if settled else rules.GROWTH)
+        return further if further < rules.ALMOST * longest else longest
 
     def layout(self, length: int) -> Layout:
         """Return pieces of a length: of all rows on long horizons, of some on short ones."""
@@ -247,7 +264,7 @@ class Search:
         plain = next((one for one in fits if not one.model.effects), None) or self.carry(last.before, layout)
         return [plain or last.before, *fits]
 
-    def carry(self, fitted: Fitted, layout: Layout, steps: int = CARRIED) -> Fitted | None:
+    def carry(self, fitted: Fitted, layout: Layout, steps: int = CARRIED, hope: float = np.inf) -> Fitted | None:
         """Return a model on another layout, from where it ended."""
         near = []
         for number, rows in enumerate(layout.rows):
@@ -256,7 +273,7 @@ class Search:
             nodes[old[valid]] = fitted.followed.nodes[number][valid]
             near.append(nodes[rows])
         ready = layout.with_substeps(fitted.model, near, self.problem.top)
-        return self.refit(fitted.model, ready, near, fitted, steps)
+        return self.refit(fitted.model, ready, near, fitted, steps, hope)
 
     def refit(
         self,
@@ -265,12 +282,13 @@ class Search:
         near: list[np.ndarray] | tuple[np.ndarray, ...],
         start: Fitted | None,
         steps: int,
+        hope: float = np.inf,
     ) -> Fitted | None:
-        """Return the fit of a model; None where it cannot be followed."""
+        """Return the fit of a model; None where it cannot be followed or comes to no cost below `hope`."""
         noise = None if start is None else start.noise
         with np.errstate(all="ignore"):
             try:
-                return fit(model, layout, near, structure=self.structure, noise=noise, steps=steps)
+                return fit(model, layout, near, structure=self.structure, noise=noise, steps=steps, hope=hope)
             except np.linalg.LinAlgError:
                 return None
 
@@ -282,10 +300,12 @@ class Search:
         for one in fits:
             self._keep(pool, one)
         opened: set[tuple[str, ...]] = set()
-        while todo := [one for one in self._leading(pool) if one.model.key not in opened]:
+        # The declared equation is opened last: one effect may do what several of the leader do.
+        while todo := [one for one in (*self._leading(pool), fits[0]) if one.model.key not in opened]:
             opened.add(todo[0].model.key)
-            leader = todo[0] is self._leading(pool)[0]
-            for found in self._neighbours(todo[0], pool, timed=leader, first=len(opened) == 1):
+            leader = self._leading(pool)[0]
+            ahead = np.inf if todo[0] is leader else self.value(leader)
+            for found in self._neighbours(todo[0], pool, ahead):
                 self._keep(pool, found)
         return self._leading(pool)
 
@@ -305,57 +325,59 @@ class Search:
                 found.append(one)
         return found
 
-    def _neighbours(self, fitted: Fitted, pool: Pool, *, timed: bool, first: bool) -> Iterator[Fitted]:
-        """Yield models with a doubtful effect less, and with one of the best candidates more."""
+    def _neighbours(self, fitted: Fitted, pool: Pool, ahead: float) -> Iterator[Fitted]:
+        """Yield models with a doubtful effect less, and with one of the best candidates more.
+
+        A rival's candidate is fitted where its score could bring the rival to the front, past the value `ahead`.
+        """
         here = self.value(fitted)
         model = fitted.model
         for number in range(len(model.effects)):
             if model.without(number).key not in pool and not self._sure(fitted, number):
-                found = self.without(fitted, number)
+                hope = fitted.cost + self.problem.price_of(model.effects[number])
+                found = self.without(fitted, number, hope)
                 if found is not None:
                     yield found
-        yield from self._plainer(fitted, pool)
+        yield from self._exchanged(fitted, pool)
         yield from self._other_side(fitted, pool)
         if len(model.effects) < rules.MOST_EFFECTS:
-            for one in self._tried(fitted, timed=timed, discrete=first):
-                if model.with_effect(one.placed).key not in pool:
+            timed = ahead == np.inf or not model.effects
+            for one in self.screened(fitted, timed=timed)[: rules.TRIED]:
+                hopeless = here - rules.UNDERSTATED * one.gain + self.problem.price_of(one.placed) > ahead
+                if not hopeless and model.with_effect(one.placed).key not in pool:
                     found = self.with_effect(fitted, one.placed)
                     if found is not None and self.value(found) < here:
                         yield found
 
-    def _plainer(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
-        """Yield models with a likelier effect in the place of one that stands in for many."""
+    def _exchanged(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
+        """Yield models with another effect in the place of one: a likelier one, or one whose score is higher."""
         for number, placed in enumerate(fitted.model.effects):
-            if placed.effect.name in rules.STAND_INS:
-                plain = [
-                    one for one in self.standing_in(fitted, number) if one.placed.effect.name not in rules.STAND_INS
-                ]
-                for one in plain[:2]:
-                    model = fitted.model.without(number).with_effect(one.placed)
-                    if model.key not in pool:
-                        found = self.refit(model, fitted.layout, fitted.followed.nodes, fitted, CHANGED)
-                        if found is not None:
-                            yield found
+            many = placed.effect.name in rules.STAND_INS
+            found = [one for one in self.standing_in(fitted, number) if self._rather(one, placed, many)]
+            for one in found[:2]:
+                model = fitted.model.without(number).with_effect(one.placed)
+                if model.key not in pool:
+                    hope = np.inf if many else fitted.cost
+                    other = self.exchanged(fitted, number, one.placed, hope)
+                    if other is not None:
+                        yield other
 
-    def _tried(self, fitted: Fitted, *, timed: bool, discrete: bool) -> list[Scored]:
-        """Return the candidates that are fitted in full."""
-        found = self.screened(fitted, timed=timed)
-        best = [one for one in found if one.placed.linear][: rules.TRIED]
-        return best + [one for one in found if discrete and not one.placed.linear]
+    def _rather(self, one: Scored, placed: Placed, many: bool) -> bool:
+        """Return whether a candidate is to be tried in the place of an effect, which may stand in for many."""
+        if many:
+            return one.placed.effect.name not in rules.STAND_INS
+        # To first order; a candidate's gain is its share of what the effect does.
+        return one.won * (1 - 1 / one.gain) / 2 + self.problem.price_of(placed) > 1 + self.problem.price_of(one.placed)
 
     def _sure(self, fitted: Fitted, number: int) -> bool:
         """Return whether an effect is beyond doubt by its numbers and their covariance."""
-        placed, block = fitted.model.effects[number], fitted.model.blocks[number]
-        strength = np.array(placed.strength)
-        if not len(strength):
+        if not fitted.model.effects[number].strength:
             return False
-        kept = slice(block.start, block.start + len(strength))
-        wald = float(strength @ np.linalg.pinv(fitted.covariance[kept, kept]) @ strength) / 2
-        return wald > self.problem.price_of(placed) + DOUBT
+        return wald(fitted, number) > self.problem.price_of(fitted.model.effects[number]) + DOUBT
 
-    def without(self, fitted: Fitted, number: int) -> Fitted | None:
-        """Return the fit without one effect."""
-        return self.refit(fitted.model.without(number), fitted.layout, fitted.followed.nodes, fitted, CHANGED)
+    def without(self, fitted: Fitted, number: int, hope: float = np.inf) -> Fitted | None:
+        """Return the fit without one effect; None where it comes to no cost below `hope`."""
+        return self.refit(fitted.model.without(number), fitted.layout, fitted.followed.nodes, fitted, CHANGED, hope)
 
     def with_effect(self, fitted: Fitted, placed: Placed) -> Fitted | None:
         """Return the fit with one effect more, from its score's numbers or, where these lead astray, from a tenth."""
@@ -363,33 +385,64 @@ class Search:
         weaker = numbers.copy()
         weaker[: len(placed.strength)] *= 0.1
         for start in (numbers, weaker) if len(placed.strength) else (numbers,):
-            model = fitted.model.with_effect(placed.moved(start))
-            found = self.refit(model, fitted.layout, fitted.followed.nodes, fitted, CHANGED)
+            model, near = self._tangent(fitted).start(placed.moved(start))
+            found = self.refit(model, fitted.layout, near, fitted, CHANGED, fitted.cost)
             if found is not None:
                 return found
         return None
 
+    def exchanged(self, fitted: Fitted, number: int, placed: Placed, hope: float) -> Fitted | None:
+        """Return the fit with another effect in the place of one; None where it comes to no cost below `hope`."""
+        model, near = self._tangent(fitted).start(placed, number)
+        return self.refit(model, fitted.layout, near, fitted, CHANGED, hope)
+
+    def climbed(self, model: Model, fitted: Fitted, hope: float) -> Fitted | None:
+        """Return the fit of a model from short pieces up to those of another fit; None where the way ends before."""
+        found = None
+        for length in self.lengths[1:-1:CLIMBING]:
+            layout = self.layout(length)
+            if found is None:
+                every = (unread(model, layout, number, nodes) for number, nodes in enumerate(self.problem.nodes))
+                near = [nodes[rows] for nodes, rows in zip(every, layout.rows, strict=True)]
+                ready = layout.with_substeps(model, near, self.problem.top)
+                found = self.refit(model, ready, near, fitted, FIRST)
+            else:
+                found = self.carry(found, layout)
+            if found is None:
+                return None
+        return None if found is None else self.carry(found, fitted.layout, hope=hope)
+
     def standing_in(self, fitted: Fitted, number: int) -> list[Scored]:
         """Return candidates that could do most of what one effect does, one of each name, the best first."""
         placed = fitted.model.effects[number]
-        if not placed.linear or placed.timed:
+        if not placed.strength or placed.timed:
             return []
         present = {one.place for one in fitted.model.effects}
         absent = [one for one in self.open if one.place not in present and not one.timed]
-        ranked = sorted(Tangent(fitted).standing_in(number, absent), key=lambda one: -one.gain)
+        ranked = sorted(self._tangent(fitted).standing_in(number, absent), key=lambda one: -one.gain)
         best: dict[tuple[object, ...], Scored] = {}
         for one in ranked:
             if one.gain > MOST_OF_IT:
                 best.setdefault((one.placed.effect.name, len(one.placed.strength)), one)
         return list(best.values())
 
+    def _tangent(self, fitted: Fitted) -> Tangent:
+        """Return the tangent of a fit; that of the last one is kept."""
+        if self._last is None or self._last.fitted is not fitted:
+            self._last = Tangent(fitted)
+        return self._last
+
     def screened(self, fitted: Fitted, *, timed: bool = True) -> list[Scored]:
-        """Return the candidates whose score is above their price, the best first; those without a score come last."""
+        """Return the candidates whose score is above their price, the best first."""
         present = {one.place for one in fitted.model.effects if not one.timed}
-        absent = [one for one in self.open if one.place not in present and (timed or not one.timed)]
+        absent = [one for one in self.open if one.place not in present and not one.timed]
+        tangent = self._tangent(fitted)
+        if timed:
+            courses = [one for one in self.open if one.timed]
+            absent += tangent.likeliest(courses, self.problem.price_of, lambda one: one.effect.name)
         best: dict[tuple[object, ...], tuple[float, Scored]] = {}
         tried: dict[str, Tried] = {}
-        for one in Tangent(fitted).scored(absent):
+        for one in tangent.scored(absent):
             name = one.placed.effect.name
             price = self.problem.price(name, one.freedom) + self.problem.locked(one.placed)
             if name not in tried or one.gain - price > tried[name].gain - tried[name].price:
@@ -398,8 +451,20 @@ class Search:
             if one.freedom and one.gain > price and (key not in best or one.gain - price > best[key][0]):
                 best[key] = (one.gain - price, one)
         self.tried[fitted.model.key] = tuple(sorted(tried.values(), key=lambda one: one.price - one.gain))
-        ranked = [one for _, one in sorted(best.values(), key=lambda pair: -pair[0])]
-        return ranked + [Scored(one, 0.0, 1, 0.0) for one in absent if not one.linear]
+        return [one for _, one in sorted(best.values(), key=lambda pair: -pair[0])]
+
+
+def wald(fitted: Fitted, number: int) -> float:
+    """Return the nats that an effect brings as far as the model is linear: half of Wald's statistic.
+
+    What has no strengths is beyond all doubt.
+    """
+    strength = np.array(fitted.model.effects[number].strength)
+    begin = fitted.model.blocks[number].start
+    kept = slice(begin, begin + len(strength))
+    if not len(strength):
+        return float("inf")
+    return float(strength @ np.linalg.pinv(fitted.covariance[kept, kept]) @ strength) / 2
 
 
 def same(one: Fitted, other: Fitted) -> bool:

@@ -96,9 +96,11 @@ def left_in(fitted: Fitted, problem: Problem) -> tuple[Left, ...]:
     terms = list(_terms(problem))
     forces = [*LocalForce.places(Effect("force-at-one-site", "1"), problem.scene)] if problem.chain.sites > 1 else []
     found = []
-    for kind in (terms, forces):
-        for one in Tangent(fitted).scored(kind):
-            share = rules.FALSE_DOUBT / 2 / max(len(kind), 1)
+    tangent = Tangent(fitted)
+    likely = tangent.likeliest(forces, lambda _: 0.0, lambda one: one.site)
+    for kind, count in ((terms, len(terms)), (likely, len(forces))):
+        for one in tangent.scored(kind):
+            share = rules.FALSE_DOUBT / 2 / max(count, 1)
             price = problem.chance(share, one.freedom)
             if one.freedom and one.gain > price:
                 words = [*one.placed.sentences(problem.chain), *one.placed.labels(problem.chain)]

@@ -22,7 +22,6 @@ class OtherEnds(Placed, acts="ends"):
     """
 
     way: Ends
-    linear: ClassVar[bool] = False
     separated_by: ClassVar[str] = "a motion far from the ends, and one at the ends"
 
     @classmethod

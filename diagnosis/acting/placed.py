@@ -163,7 +163,6 @@ class Placed(ABC):
         shape: names of the fields that a fit changes besides.
         instrument: whether it acts on readings, not on the motion.
         timed: whether it has a frequency or a time of its own; it can then stand in for much on short horizons.
-        linear: whether a score test can rank it; else it is tried outright.
         local: whether it acts at single sites, or at each differently.
         separated_by: the measurement that tells this way of acting from others; nothing where none is known.
     """
@@ -173,7 +172,6 @@ class Placed(ABC):
     shape: ClassVar[tuple[str, ...]] = ()
     instrument: ClassVar[bool] = False
     timed: ClassVar[bool] = False
-    linear: ClassVar[bool] = True
     local: ClassVar[bool] = False
     separated_by: ClassVar[str] = ""
 

@@ -258,3 +258,14 @@ def test_parts_that_the_readings_cannot_show_are_left_out():
     found = estimate(left, np.zeros((100, 1)), rows, structure=EVERY_PART)
     assert found.structure == Structure(tails=True)
     assert found.memory[0] == found.growth == 0
+
+
+def test_the_transposed_whitener_is_the_transposed_matrix():
+    draw = np.random.default_rng(6)
+    rows = rows_of(30, 3, pieces=(11,))
+    noise = Noise(np.array([1.0, 2.0, 3.0]), 0.2, np.inf, np.array([0.1, 0.0, 0.3]), EVERY_PART)
+    whitener = noise.whitener(levels_of(rows), rows, draw.random((30, 3)) > 0.3)
+    x, z = draw.normal(size=(2, 30, 3))
+    assert np.sum(z * whitener.apply(x)) == pytest.approx(np.sum(whitener.transposed(z) * x))
+    many = draw.normal(size=(30, 3, 2))
+    np.testing.assert_allclose(whitener.transposed(many)[..., 1], whitener.transposed(many[..., 1]), rtol=1e-14)
