@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 # What `latticebench fit` uses when no method is named.
 DEFAULT = "stlsq"
+# Methods of earlier versions, and what they are called now.
+RENAMED = {"pinn-vp": "pielm"}
 
 
 def registered() -> dict[str, type[Method]]:
@@ -56,6 +58,8 @@ def find(name: str, base: Path | None = None) -> type[Method]:
             raise unknown("method", wanted, kinds, str(full))
         return kinds[wanted or next(iter(kinds))]
     known = registered()
+    if name in RENAMED:
+        raise InputError(f"method {name!r} is called {RENAMED[name]!r} now; write {RENAMED[name]}")
     if name not in known:
         raise InputError(f"{unknown('method', name, known)} (or the path of a .py file)")
     return known[name]

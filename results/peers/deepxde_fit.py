@@ -166,7 +166,7 @@ def main() -> None:
 
     made = origin()
     rows = []
-    for name in ("pinn", "pinn-vp"):
+    for name in ("pinn", "pielm"):
         fit = solve(make(methods.find(name), {}), [samples], library, 2, SEED)
         assert fit.history is not None
         good = min(first_good(fit.history.seconds, errors(fit.history.coefficients)), fit.seconds)

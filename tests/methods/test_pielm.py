@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench import systems
-from latticebench.methods import pinn_vp
+from latticebench import methods, systems
+from latticebench.methods import pielm
 from latticebench.methods.engine.networks.members import member_draws
 from latticebench.methods.method import Skipped, make, solve
-from latticebench.methods.pinn_vp import PINNVP
+from latticebench.methods.pielm import PIELM
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -37,7 +37,7 @@ def oscillators(sites: int = 3) -> tuple[Samples, np.ndarray]:
 
 def test_an_oscillator_is_found_to_many_digits():
     samples, truth = oscillators()
-    fit = solve(PINNVP(), [samples], library("lib", "u[n]; u[n]**3"), 2, 0)
+    fit = solve(PIELM(), [samples], library("lib", "u[n]; u[n]**3"), 2, 0)
     np.testing.assert_allclose(fit.coefficients, truth, atol=1e-5)
     assert fit.status == "ok"
     assert fit.history is not None
@@ -51,7 +51,7 @@ def test_phi4_without_noise_and_with_one_per_cent_is_found():
     truth = clean.truth(candidates)
     assert truth is not None
     for samples, bound in ((clean, 1e-4), (observe(clean, np.random.default_rng(0), noise=0.01), 3e-2)):
-        fit = solve(PINNVP(width=60), [samples], candidates, 2, 0)
+        fit = solve(PIELM(width=60), [samples], candidates, 2, 0)
         assert np.linalg.norm(fit.coefficients - truth) <= bound * np.linalg.norm(truth)
 
 
@@ -66,7 +66,7 @@ def test_standard_errors_have_the_size_of_the_errors():
             samples.u + 0.02 * draw.normal(size=samples.u.shape),
             samples.v + 0.02 * draw.normal(size=samples.u.shape),
         )
-        fit = solve(PINNVP(**SMALL), [noisy], library("lib", "u[n]; u[n]**3"), 2, seed)
+        fit = solve(PIELM(**SMALL), [noisy], library("lib", "u[n]; u[n]**3"), 2, seed)
         assert fit.stderr is not None
         shares.append((fit.coefficients - truth) / fit.stderr)
     assert 0.4 < np.sqrt(np.mean(np.square(shares))) < 2.5
@@ -76,7 +76,7 @@ def test_missing_values_and_velocities_that_were_not_observed_are_taken():
     samples, truth = oscillators()
     u = samples.u.copy()
     u[np.random.default_rng(4).uniform(size=u.shape) < 0.2] = np.nan
-    fit = solve(PINNVP(**SMALL), [Samples(samples.t, u)], library("lib", "u[n]; u[n]**3"), 2, 0)
+    fit = solve(PIELM(**SMALL), [Samples(samples.t, u)], library("lib", "u[n]; u[n]**3"), 2, 0)
     np.testing.assert_allclose(fit.coefficients, truth, atol=1e-2)
 
 
@@ -87,25 +87,25 @@ def test_a_measured_input_and_two_trajectories_are_taken():
         Samples(t[:length], (np.cos(t) / 3 + b * np.cos(2 * t))[:length, None], f=np.cos(t)[:length, None])
         for b, length in ((0.2, 61), (-0.5, 45))
     ]
-    fit = solve(PINNVP(width=40), data, library("lib", "u[n]; f[n]"), 2, 0)
+    fit = solve(PIELM(width=40), data, library("lib", "u[n]; f[n]"), 2, 0)
     np.testing.assert_allclose(fit.coefficients, [-4, 1], atol=1e-2)
 
 
 def test_the_same_seed_gives_the_same_digits():
     samples, _ = oscillators()
-    first, again = (solve(PINNVP(**SMALL), [samples], library("lib", "u[n]"), 2, 5) for _ in range(2))
+    first, again = (solve(PIELM(**SMALL), [samples], library("lib", "u[n]"), 2, 5) for _ in range(2))
     np.testing.assert_array_equal(first.coefficients, again.coefficients)
 
 
 def test_too_many_unknowns_are_a_reason_to_skip():
     with pytest.raises(Skipped, match="width"):
-        solve(PINNVP(), [chain(400)], library("lib", "u[n]"), 2, 0)
+        solve(PIELM(), [chain(400)], library("lib", "u[n]"), 2, 0)
 
 
 @pytest.mark.parametrize(("name", "value"), [("width", 0), ("weights", []), ("tolerance", -1.0), ("members", 0)])
 def test_unsound_settings_are_named(name, value):
     with pytest.raises(InputError, match=name):
-        make(PINNVP, {name: value})
+        make(PIELM, {name: value})
 
 
 def noisy(samples: Samples, sigma: float, seed: int) -> Samples:
@@ -132,7 +132,7 @@ def test_one_network_on_the_processor_keeps_its_numbers():
         ),
     ]
     for data, coefficients, stderr in kept:
-        fit = solve(PINNVP(**SMALL), [data], library("lib", "u[n]; u[n]**3"), 2, 0)
+        fit = solve(PIELM(**SMALL), [data], library("lib", "u[n]; u[n]**3"), 2, 0)
         np.testing.assert_allclose(fit.coefficients, coefficients, rtol=1e-6, atol=1e-7)
         assert fit.stderr is not None
         np.testing.assert_allclose(fit.stderr, stderr, rtol=1e-6)
@@ -155,8 +155,7 @@ def test_torch_on_the_processor_agrees_with_numpy_for_one_network_and_for_a_batc
     data, texts, order = DATA[name]
     candidates = library("lib", texts)
     plain, torch = (
-        solve(PINNVP(**SMALL, members=members, device=device), data, candidates, order, 5)
-        for device in ("cpu", "cpu:0")
+        solve(PIELM(**SMALL, members=members, device=device), data, candidates, order, 5) for device in ("cpu", "cpu:0")
     )
     scale = np.max(np.abs(plain.coefficients))
     np.testing.assert_allclose(torch.coefficients, plain.coefficients, rtol=1e-7, atol=1e-8 * scale)
@@ -169,14 +168,19 @@ def test_torch_on_the_processor_agrees_with_numpy_for_one_network_and_for_a_batc
 
 def test_of_several_members_the_best_is_the_fit_and_their_spread_is_that_of_the_single_ones(monkeypatch):
     data, candidates = [noisy(oscillators()[0], 0.02, 3)], library("lib", "u[n]; u[n]**3")
-    whole = solve(PINNVP(**SMALL, members=3), data, candidates, 2, 5)
+    whole = solve(PIELM(**SMALL, members=3), data, candidates, 2, 5)
     alone = []
     for draw in range(3):
-        monkeypatch.setattr(pinn_vp, "member_draws", lambda seed, _members, k=draw: member_draws(seed, 3)[k : k + 1])
-        alone.append(solve(PINNVP(**SMALL), data, candidates, 2, 5))
+        monkeypatch.setattr(pielm, "member_draws", lambda seed, _members, k=draw: member_draws(seed, 3)[k : k + 1])
+        alone.append(solve(PIELM(**SMALL), data, candidates, 2, 5))
     best = min(alone, key=lambda fit: fit.found["noise"])
     assert np.array_equal(whole.coefficients, best.coefficients)
     assert whole.found["noise"] == best.found["noise"]
     spread = np.std([fit.coefficients for fit in alone], axis=0, ddof=1)
     found = [whole.found[f"spread of {text}"] for text in candidates.texts]
     np.testing.assert_allclose(found, spread, rtol=1e-12)
+
+
+def test_the_name_that_it_had_is_refused_with_the_one_that_it_has() -> None:
+    with pytest.raises(InputError, match="'pinn-vp' is called 'pielm' now; write pielm"):
+        methods.find("pinn-vp")

@@ -1,4 +1,8 @@
-"""A physics-informed network whose output layer and coefficients are solved for, not descended to.
+"""A physics-informed extreme learning machine: a hidden layer that is drawn, and a least-squares problem for the rest.
+
+The literature's name for a network whose hidden units stay as they were drawn and which is held to an equation
+(Dwivedi & Srinivasan, Neurocomputing 391, 96 (2020); Dong & Li, Comput. Methods Appl. Mech. Eng. 387, 114129 (2021));
+here the coefficients of the equation are unknown, too.
 
 One hidden layer of tanh units takes the time t and gives phi_k(t); the field is u_n(t) = sum_k a_kn phi_k(t). The
 velocity and the rate are its exact time derivatives, so that no residual of du/dt - v is needed. Output weights a and
@@ -46,7 +50,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class PINNVP:
+class PIELM:
     """A network with its output layer and coefficients solved by least squares; see the module.
 
     Attributes:
@@ -67,7 +71,7 @@ class PINNVP:
         InputError: a number is unsound.
     """
 
-    name: ClassVar[str] = "pinn-vp"
+    name: ClassVar[str] = "pielm"
     width: int = 80
     bandwidth: float = 3.0
     collocation: int = 201
@@ -248,4 +252,4 @@ class SolvedNetwork(NamedTuple):
     smooth: tuple[Smooth, ...]
 
 
-METHODS = (PINNVP,)
+METHODS = (PIELM,)
