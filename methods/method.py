@@ -15,6 +15,7 @@ Heavy packages (torch, pysindy) are imported where they are used, so that listin
 from __future__ import annotations
 
 import importlib
+import numbers
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -30,6 +31,9 @@ from latticebench.systems.stencil import ghosts
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
+
+# Characters of what a method says of its fit.
+MOST_SAID = 2000
 
 
 @dataclass(frozen=True)
@@ -185,7 +189,8 @@ def make(kind: type[Method], given: Mapping[str, Any]) -> Method:
             if isinstance(value, str) and value.startswith(("[", "{")):
                 values[name] = adapter.validate_json(value)
             else:
-                values[name] = adapter.validate_python(value)
+                # pydantic would take true for 1.
+                values[name] = adapter.validate_python(value, strict=isinstance(value, bool))
         except pydantic.ValidationError as error:
             reason = error.errors()[0]["msg"]
             raise InputError(f"method {kind.name!r}: setting {name} = {value!r}: {reason}") from None
@@ -211,8 +216,8 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
     Raises:
         Skipped: the method declares that it cannot take these data.
         InputError: the library cannot be evaluated on the data.
-        TypeError: the method returned something else than a Fit.
-        ValueError: a coefficient is not finite.
+        TypeError: the method returned something else than a Fit, or a part of it is of another type.
+        ValueError: a coefficient is not finite, or the fit is of another library.
     """
     check_fit(data, library, order)
     reason = obstacle(method.abilities, data, library)
@@ -223,11 +228,29 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
         importlib.import_module(package)
     wall, cpu = time.perf_counter(), time.process_time()
     fit = method.fit(shown, library, order, seed)
+    _check_returned(fit, library)
+    return replace(fit, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
+
+
+def _check_returned(fit: Any, library: Library) -> None:
+    """Refuse what is no fit of a library; a method of a user's may return anything."""
     if not isinstance(fit, Fit):
         raise TypeError(f"fit() returned {type(fit).__name__}; it must return a Fit")
+    for name, array in (("coefficients", fit.coefficients), ("stderr", fit.stderr)):
+        if array is not None and not (isinstance(array, np.ndarray) and array.dtype.kind in "fiu"):
+            raise TypeError(f"{name} must be a NumPy array of real numbers")
     if not np.all(np.isfinite(fit.coefficients)):
         raise ValueError("the coefficients are not finite")
-    return replace(fit, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
+    if fit.library.texts != library.texts:
+        raise ValueError("the fit is of another library; return the one that fit() was given")
+    if not isinstance(fit.status, str) or len(fit.status) > MOST_SAID:
+        raise TypeError(f"status must be a text of at most {MOST_SAID} characters")
+    if not isinstance(fit.residual, numbers.Real):
+        raise TypeError(f"residual must be a number, it is {type(fit.residual).__name__}")
+    if not isinstance(fit.found, Mapping) or any(
+        not isinstance(one, (str, numbers.Real)) for one in fit.found.values()
+    ):
+        raise TypeError("found must be a dictionary of numbers and texts")
 
 
 def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:

@@ -24,6 +24,7 @@ import numpy as np
 from latticebench.methods.engine.collocation import Curves, NormalEquations, normal_equations, objective, place_curves
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.methods.engine.record import prepare, without_halves
+from latticebench.methods.engine.scaled import inverse_of_squares
 from latticebench.methods.engine.shooting import LEAST_NOISE
 from latticebench.methods.engine.starts import approach, smooth
 from latticebench.methods.method import Abilities, Fit, History, Smooth
@@ -183,7 +184,7 @@ class Splines:
                     normal_equations(one, c, coefficients, sigma, weight)
                     for one, c in zip(curves, splines, strict=True)
                 ]
-                covariance = _inverse(np.sum([step.schur for step in steps], axis=0))
+                covariance = inverse_of_squares(np.sum([step.schur for step in steps], axis=0))
             except np.linalg.LinAlgError:
                 return None
             change = covariance @ np.sum([step.aim for step in steps], axis=0)
@@ -234,13 +235,6 @@ def _first_stage(curves: Sequence[Curves], splines: list[ndarray], coefficients:
     sigma = np.maximum(sigma, np.maximum(1e-6 * scale.height, scale.floor))
     weight = float(np.sum(scale.counts)) / max(left, 1e-300)
     return _Stage(weight, splines, coefficients, misfit, sigma, np.full((len(coefficients),) * 2, np.nan))
-
-
-def _inverse(schur: ndarray) -> ndarray:
-    """Return the pseudo-inverse of a positive matrix, found with its diagonal scaled to 1."""
-    scale = np.sqrt(np.maximum(np.diag(schur), 1e-300))
-    scaled = schur / scale / scale[:, None]
-    return np.asarray(np.linalg.pinv(scaled, rcond=1e-13, hermitian=True) / scale / scale[:, None])
 
 
 def _score(misfit: ndarray, used: ndarray, scale: _Scale) -> float:

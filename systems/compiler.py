@@ -38,6 +38,16 @@ class Slot:
     offset: int = 0
     part: Literal["re", "im"] = "re"
 
+    @property
+    def place(self) -> tuple[int, int]:
+        """Where an array (order, parts, ...) of u and v has the field: 0 for u and 1 for v, 0 for re and 1 for im."""
+        return int(self.name == "v"), int(self.part == "im")
+
+    @property
+    def vector(self) -> tuple[int, ...]:
+        """The offset as `latticebench.systems.stencil.Stencil` takes it."""
+        return (self.offset,)
+
 
 @dataclass(frozen=True)
 class Compiled:

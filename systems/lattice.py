@@ -16,7 +16,7 @@ import numpy as np
 
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.parser import FUNCTIONS, TermError, parse
-from latticebench.systems.stencil import Ends, reach_of
+from latticebench.systems.stencil import Ends, numbers, reach_of
 from latticebench.systems.terms import Term, express, substitute, symbolic
 
 if TYPE_CHECKING:
@@ -249,7 +249,7 @@ class System:
         if kind not in self.initials:
             raise unknown("initial state", kind, self.initials, f"system {self.name!r}")
         values = self.with_parameters(parameters)
-        n = np.arange(sites) - (sites - 1) / 2
+        n = numbers(sites)
         # A length that is infinite, negative or not real becomes nan, which is reported below.
         with np.errstate(all="ignore"):
             length = _positive(_numeric(self.half_length, {**values, "N": float(sites)}))

@@ -12,7 +12,7 @@ import numpy as np
 from latticebench.systems.compiler import Slot, compiled, partials, real_parts
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import System
-from latticebench.systems.stencil import Ends, Stencil
+from latticebench.systems.stencil import Ends, Stencil, numbers
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
@@ -94,14 +94,13 @@ class Motion:
         bundle, places = partials((self.term.text,), self.is_complex)
         gather = self._gather(bundle.slots)
         size, sites = self.parts * self.sites, self.sites
-        index, factor = self._stencil.ghosts
         rows, columns, weights = [], [], []
         for _, part, slot in places:
-            window = self._stencil.window(slot.offset)
+            index, factor = self._stencil.neighbours(slot.vector)
             block = (size if slot.name == "v" else 0) + (sites if slot.part == "im" else 0)
             rows.append((self.order - 1) * size + part * sites + np.arange(sites))
-            columns.append(block + index[window])
-            weights.append(factor[window])
+            columns.append(block + index)
+            weights.append(factor)
         shape = (self.order * size, self.order * size)
         identity = (
             scipy.sparse.csc_array((np.ones(size), (np.arange(size), size + np.arange(size))), shape=shape)
@@ -121,12 +120,14 @@ class Motion:
 
     @functools.cached_property
     def _stencil(self) -> Stencil:
-        return Stencil(self.sites, self.term.reach, self.ends)
+        return Stencil.chain(self.sites, self.term.reach, self.ends)
 
     def _gather(self, slots: tuple[Slot, ...]) -> Callable[[float, ndarray], list[Any]]:
         """Return the function that cuts a state into the arrays that a compiled term takes."""
-        stencil, numbers = self._stencil, self._stencil.numbers
-        windows = [stencil.window(slot.offset) for slot in slots]
+        stencil, n = self._stencil, numbers(self.sites)
+        places: list[tuple[Any, ...]] = [
+            () if slot.name in ("t", "n") else (*slot.place, *stencil.window(slot.vector)) for slot in slots
+        ]
         shape = (self.order, self.parts, self.sites)
         if any(slot.name == "f" for slot in slots):
             raise InputError(
@@ -136,13 +137,13 @@ class Motion:
         def arrays(t: float, y: ndarray) -> list[Any]:
             padded = stencil.pad(y.reshape(shape))
             found: list[Any] = []
-            for slot, window in zip(slots, windows, strict=True):
+            for slot, place in zip(slots, places, strict=True):
                 if slot.name == "t":
                     found.append(t)
                 elif slot.name == "n":
-                    found.append(numbers)
+                    found.append(n)
                 else:
-                    found.append(padded[int(slot.name == "v"), int(slot.part == "im"), window])
+                    found.append(padded[place])
             return found
 
         return arrays

@@ -1,12 +1,14 @@
-"""Sites, offsets, windows and ends of a chain, and the values of terms along a trajectory.
+"""Sites, offsets, windows and ends of a lattice, and the values of terms along a trajectory.
 
-The last axis of an array holds the sites: site k = 0..N-1 of an array is the paper's n = k + 1. The n of the term
-language is counted from the middle of the chain, k - (N - 1)/2.
+A lattice has a shape, the number of sites along each axis, and an offset from one site to another is a vector. A chain
+has the shape (N,) and offsets (k,): site k = 0..N-1 of an array is the paper's n = k + 1. The n of the term language is
+counted from the middle of the chain, k - (N - 1)/2. All who read neighbours ask the `Stencil`.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,10 +20,11 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
     from numpy import ndarray
 
 Ends = Literal["unknown", "free", "fixed", "periodic", "antiperiodic"]
+Offset = tuple[int, ...]
 
 
 @functools.lru_cache(maxsize=256)
@@ -71,46 +74,101 @@ def reach_of(terms: Sequence[Term]) -> tuple[int, int]:
     return max(term.reach[0] for term in terms), max(term.reach[1] for term in terms)
 
 
+def numbers(sites: int) -> Float[ndarray, " sites"]:
+    """Return the n of the term language at all sites of a chain."""
+    return np.arange(sites) - (sites - 1) / 2
+
+
 @dataclass(frozen=True)
 class Stencil:
-    """The sites that terms read around each site of a chain.
+    """The sites that terms read around each site of a lattice.
 
-    A field is padded with what the ends repeat; u[n+k] at all inner sites is then `padded[..., window(k)]`.
+    A field is padded with what the ends repeat; u at an offset from all inner sites is then `padded[..., *window]`.
 
     Attributes:
-        sites: N.
-        reach: the number of sites that are read to the left and to the right.
-        ends: how the chain ends; where this is unknown, the inner sites are those whose whole stencil was observed.
+        shape: the number of sites along each axis.
+        reach: the number of sites that are read downwards and upwards along each axis.
+        ends: how the lattice ends; where this is unknown, the inner sites are those whose whole stencil was observed.
     """
 
-    sites: int
-    reach: tuple[int, int]
+    shape: tuple[int, ...]
+    reach: tuple[tuple[int, int], ...]
     ends: Ends
 
+    @classmethod
+    def chain(cls, sites: int, reach: tuple[int, int], ends: Ends) -> Stencil:
+        """Return the stencil of a chain of `sites` sites that are read `reach` to the left and to the right."""
+        return cls((sites,), (reach,), ends)
+
+    @property
+    def is_ring(self) -> bool:
+        """Whether the last site is a neighbour of the first."""
+        return self.ends in ("periodic", "antiperiodic")
+
     @functools.cached_property
-    def ghosts(self) -> tuple[Int[ndarray, " padded"], Float[ndarray, " padded"]]:
-        """Index and factor of each site of a padded field (see the function `ghosts`)."""
-        return ghosts(self.sites, *self.reach, self.ends)
+    def inner(self) -> tuple[slice, ...]:
+        """The sites at which the terms have a value, along each axis."""
+        return tuple(observed(sites, reach, self.ends) for sites, reach in zip(self.shape, self.reach, strict=True))
 
-    @property
-    def inner(self) -> slice:
-        """The sites at which the terms have a value."""
-        return observed(self.sites, self.reach, self.ends)
+    @functools.cached_property
+    def own(self) -> Int[ndarray, " inner"]:
+        """The places of the inner sites among all sites."""
+        return np.arange(np.prod(self.shape)).reshape(self.shape)[self.inner].ravel()
 
-    @property
-    def numbers(self) -> Float[ndarray, " inner"]:
-        """The n of the term language at the inner sites."""
-        return (np.arange(self.sites) - (self.sites - 1) / 2)[self.inner]
+    @functools.cached_property
+    def border(self) -> Int[ndarray, " border"]:
+        """The places of the other sites."""
+        return np.setdiff1d(np.arange(np.prod(self.shape)), self.own)
 
-    def pad(self, field: ndarray) -> ndarray:
-        """Return a field (..., N) with what the ends repeat on both sides."""
-        index, factor = self.ghosts
-        return np.asarray(field[..., index] * factor)
+    @functools.cached_property
+    def offsets(self) -> tuple[Offset, ...]:
+        """All offsets that are read."""
+        return tuple(itertools.product(*(range(-left, right + 1) for left, right in self.reach)))
 
-    def window(self, offset: int) -> slice:
-        """Return the part of a padded field that is read at `offset` from all inner sites."""
-        first = self.reach[0] + offset
-        return slice(first, first + self.inner.stop - self.inner.start)
+    @functools.cached_property
+    def _ghosts(self) -> tuple[tuple[ndarray, ndarray], ...]:
+        return tuple(ghosts(sites, *reach, self.ends) for sites, reach in zip(self.shape, self.reach, strict=True))
+
+    @functools.cached_property
+    def _factor(self) -> Float[ndarray, " *padded"] | None:
+        """The factor of each site of a padded field; None for 1."""
+        whole = functools.reduce(np.multiply.outer, (factor for _, factor in self._ghosts))
+        return None if np.all(whole == 1) else whole
+
+    @functools.cached_property
+    def walls(self) -> Bool[ndarray, " *padded"]:
+        """Where a padded field is zero, whatever value stands in for it."""
+        return np.asarray(functools.reduce(np.multiply.outer, (factor for _, factor in self._ghosts)) == 0)
+
+    def pad(self, field: ndarray, after: int = 0) -> ndarray:
+        """Return a field with what the ends repeat on all sides; its last axes but `after` hold the sites."""
+        first = field.ndim - after - len(self.shape)
+        if self.ends != "unknown":
+            for axis, (index, _) in enumerate(self._ghosts):
+                field = np.take(field, index, axis=first + axis)
+        if self._factor is not None:
+            field = field * self._factor.reshape(self._factor.shape + (1,) * after)
+        return field
+
+    @functools.cached_property
+    def _windows(self) -> dict[Offset, tuple[Any, ...]]:
+        found = {}
+        for offset in self.offsets:
+            begins = [left + k for (left, _), k in zip(self.reach, offset, strict=True)]
+            pairs = zip(begins, self.inner, strict=True)
+            found[offset] = tuple(slice(begin, begin + inner.stop - inner.start) for begin, inner in pairs)
+        return found
+
+    def window(self, offset: Offset) -> tuple[Any, ...]:
+        """Return the part of a padded field that is read at `offset` from all inner sites, a slice along each axis."""
+        return self._windows[offset]
+
+    def neighbours(self, offset: Offset) -> tuple[Int[ndarray, " inner"], Float[ndarray, " inner"]]:
+        """Return the places of the sites that are read at `offset` from each inner site, and their factors."""
+        windows = self.window(offset)
+        parts = [(index[one], factor[one]) for (index, factor), one in zip(self._ghosts, windows, strict=True)]
+        place = np.ravel_multi_index(np.ix_(*(index for index, _ in parts)), self.shape)
+        return place.ravel(), functools.reduce(np.multiply.outer, (factor for _, factor in parts)).ravel()
 
 
 def evaluate(
@@ -145,24 +203,25 @@ def evaluate(
         if name in needed and array is None:
             raise InputError(f"the library uses {name}[n], but the data have no {what}")
     is_complex = np.iscomplexobj(u)
-    stencil = Stencil(u.shape[1], reach_of(terms) if reach is None else reach, ends)
-    walls = stencil.ghosts[1] == 0
+    stencil = Stencil.chain(u.shape[1], reach_of(terms) if reach is None else reach, ends)
     fields: dict[str, ndarray] = {}
     for name, array in (("u", u), ("v", v), ("f", f)):
         if array is not None:
             # A wall holds zero even where the value that stands in for it is missing.
-            fields[name] = np.where(walls, 0.0, stencil.pad(array))
-    shape = (len(t), len(stencil.numbers))
+            fields[name] = np.where(stencil.walls, 0.0, stencil.pad(array))
+    n = numbers(u.shape[1])[stencil.inner]
+    shape = (len(t), len(n))
     bundle = compiled(tuple(term.text for term in terms), is_complex)
     arrays: list[Any] = []
     for slot in bundle.slots:
         if slot.name == "t":
             arrays.append(np.broadcast_to(t[:, None], shape))
         elif slot.name == "n":
-            arrays.append(np.broadcast_to(stencil.numbers, shape))
+            arrays.append(np.broadcast_to(n, shape))
         else:
             field = fields[slot.name]
-            arrays.append((field.imag if slot.part == "im" else field.real)[:, stencil.window(slot.offset)])
+            part = field.imag if slot.part == "im" else field.real
+            arrays.append(part[(slice(None), *stencil.window(slot.vector))])
     # A term that is not finite somewhere (log of 0, an overflow) says so by its value; no warning is needed.
     with np.errstate(all="ignore"):
         values = bundle.function(*arrays)

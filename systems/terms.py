@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
 
+# Rounding leaves less of an expression that is zero.
+NOTHING = 1e-9
+
+
 @dataclass(frozen=True)
 class Term:
     """One function of the stencil, kept as the text that was given.
@@ -52,11 +56,7 @@ class Term:
     @property
     def sites(self) -> frozenset[tuple[str, int]]:
         """The fields and offsets that occur, such as ("u", 1) for u[n+1]."""
-        return frozenset(
-            (node.value.id, site_offset(node.slice) or 0)
-            for node in ast.walk(parse(self.text))
-            if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name)
-        )
+        return _sites(self.text)
 
     @property
     def names(self) -> frozenset[str]:
@@ -98,12 +98,10 @@ class Term:
     @property
     def parity(self) -> Literal[-1, 1] | None:
         """1 for a term that is even under (u, v, f) -> -(u, v, f), -1 for an odd one, None for neither."""
-        import sympy
-
         flipped = self.expression.subs({s: -s for s in self.expression.free_symbols if s.name[0] in FIELDS})
-        if sympy.simplify(flipped - self.expression) == 0:
+        if _vanishes(flipped - self.expression):
             return 1
-        return -1 if sympy.simplify(flipped + self.expression) == 0 else None
+        return -1 if _vanishes(flipped + self.expression) else None
 
     @property
     def turns_with_phase(self) -> bool:
@@ -114,7 +112,33 @@ class Term:
         fields = [s for s in self.expression.free_symbols if s.name[0] in FIELDS]
         turned = self.expression.subs({s: s * turn for s in fields}, simultaneous=True)
         difference = sympy.expand(turned / turn - self.expression).replace(sympy.Abs, _abs_of_product)
-        return bool(sympy.simplify(difference) == 0)
+        return _vanishes(difference)
+
+
+def _vanishes(expression: sympy.Expr) -> bool:
+    """Return whether an expression is zero everywhere, by its value at a point before SymPy simplifies it.
+
+    SymPy takes sines of large multiples of u apart, without end.
+    """
+    import sympy
+
+    if expression == 0:
+        return True
+    symbols = sorted(expression.free_symbols, key=lambda one: one.name)
+    point = {one: (0.3 + 0.1 * k) + (0 if one.is_real else 0.2j) for k, one in enumerate(symbols)}
+    value = expression.subs(point).evalf()
+    if value.is_number and abs(complex(value)) > NOTHING:
+        return False
+    return bool(sympy.simplify(expression) == 0)
+
+
+@functools.lru_cache(maxsize=4096)
+def _sites(text: str) -> frozenset[tuple[str, int]]:
+    return frozenset(
+        (node.value.id, site_offset(node.slice) or 0)
+        for node in ast.walk(parse(text))
+        if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name)
+    )
 
 
 def _abs_of_product(argument: sympy.Expr) -> sympy.Expr:

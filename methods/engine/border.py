@@ -28,9 +28,9 @@ def choose_basis(samples: Samples, dynamics: Dynamics) -> BSplines:
     most = len(t) * len(fields)
     degree = min(DEGREE, max(1, most // 2 - 1))
     sizes = sorted({min(degree + 1 + round(x), most) for x in np.geomspace(1, max(most - degree - 1, 1), 16)})
-    best, chosen = np.inf, BSplines(_knots(t, sizes[0], degree), degree)
+    best, chosen = np.inf, _basis(t, sizes[0], degree)
     for size in sizes:
-        basis = BSplines(_knots(t, size, degree), degree)
+        basis = _basis(t, size, degree)
         score = _cross_validation(basis, t, fields)
         if score < best:
             best, chosen = score, basis
@@ -49,10 +49,9 @@ def _fields(samples: Samples, dynamics: Dynamics) -> list[ndarray]:
     return [split_parts(one[:, dynamics.border], samples.is_complex).reshape(len(samples.t), -1) for one in fields]
 
 
-def _knots(t: ndarray, size: int, degree: int) -> ndarray:
-    """Return the knots of `size` B-splines over the sample times, as dense as the samples are."""
-    inner = np.interp(np.linspace(0, 1, size - degree + 1)[1:-1], np.linspace(0, 1, len(t)), t)
-    return np.concatenate([np.full(degree + 1, t[0]), inner, np.full(degree + 1, t[-1])])
+def _basis(t: ndarray, size: int, degree: int) -> BSplines:
+    """Return `size` B-splines over the sample times, as dense as the samples are."""
+    return BSplines.clamped(np.interp(np.linspace(0, 1, size - degree + 1), np.linspace(0, 1, len(t)), t), degree)
 
 
 def _least_squares(basis: BSplines, t: ndarray, fields: Sequence[ndarray]) -> tuple[ndarray, ndarray, int]:

@@ -24,6 +24,12 @@ class BSplines:
     knots: Float[ndarray, " knots"]
     degree: int
 
+    @classmethod
+    def clamped(cls, edges: Float[ndarray, " edges"], degree: int) -> BSplines:
+        """Return the basis with knots at increasing times, the first and the last of them repeated."""
+        ends = np.full(degree, edges[0]), np.full(degree, edges[-1])
+        return cls(np.concatenate([ends[0], edges, ends[1]]), degree)
+
     @property
     def count(self) -> int:
         """The number m of B-splines."""
@@ -59,8 +65,17 @@ class BSplines:
         return span - degree, value, slope
 
     def design(self, t: Float[ndarray, " time"], derivative: int) -> Float[ndarray, "time splines"]:
-        """Return the values (`derivative` 0) or slopes (1) of all B-splines as a matrix."""
-        first, *curves = self.basis(t)
-        dense = np.zeros((len(t), self.count))
-        dense[np.arange(len(t))[:, None], first[:, None] + np.arange(self.degree + 1)] = curves[derivative]
-        return dense
+        """Return the values of all B-splines, or of their derivatives, as a matrix."""
+        from scipy.interpolate import BSpline
+
+        return np.asarray(BSpline(self.knots, np.eye(self.count), self.degree)(t, derivative))
+
+
+def through(
+    t: Float[ndarray, " time"], values: Float[ndarray, "time *each"], degree: int
+) -> tuple[BSplines, Float[ndarray, "splines *each"]]:
+    """Return the B-splines and coefficients, one per time, of the curve through values at all times."""
+    from scipy.interpolate import make_interp_spline
+
+    curve = make_interp_spline(t, values, k=degree)
+    return BSplines(curve.t, degree), np.asarray(curve.c)

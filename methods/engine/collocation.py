@@ -78,25 +78,22 @@ def place_curves(record: Record, degree: int, density: float) -> Curves:
         density: knot intervals per interval between samples.
     """
     import scipy.sparse
-    from scipy.interpolate import BSpline
 
     dynamics = record.stretches.dynamics
     t = record.times
     intervals = max(2, round(density * (len(t) - 1)))
     edges = np.linspace(t[0], t[-1], intervals + 1)
-    knots = np.concatenate([np.full(degree, t[0]), edges, np.full(degree, t[-1])])
-    basis = BSplines(knots, degree)
+    basis = BSplines.clamped(edges, degree)
     nodes, weights = np.polynomial.legendre.leggauss(2)
     half = (edges[1] - edges[0]) / 2
     points = ((edges[1:] + edges[:-1])[:, None] / 2 + half * nodes).ravel()
     measure = np.tile(weights * half, intervals) / (t[-1] - t[0])
-    every = BSpline(knots, np.eye(basis.count), degree)
-    levels = tuple(np.asarray(every(points, k)) for k in range(3))
+    levels = tuple(basis.design(points, k) for k in range(3))
     identity = scipy.sparse.identity(dynamics.parts * dynamics.sites, format="csr")
     maps, values = [], []
     for level in range(record.value.shape[1]):
         seen = np.flatnonzero(record.seen[:, level].reshape(-1))
-        at_samples = scipy.sparse.csr_array(np.asarray(every(t, level)))
+        at_samples = scipy.sparse.csr_array(basis.design(t, level))
         maps.append(scipy.sparse.csr_array(scipy.sparse.kron(at_samples, identity, format="csr")[seen]))
         values.append(record.value[:, level].reshape(-1)[seen])
     rough = None
@@ -156,16 +153,15 @@ def _by_spline(curves: Curves, slopes: dict[Any, ndarray], size: int) -> Any:
 
     dynamics = curves.record.stretches.dynamics
     parts, sites, count = dynamics.parts, dynamics.sites, dynamics.count
-    index, factor = dynamics.ghosts
-    moving = np.arange(sites)[dynamics.moving]
     # One block per variable: order of its time derivative, part of the equation, own part, sites, slope.
     blocks: list[tuple[int, int, int, ndarray, ndarray]] = [
-        (dynamics.order, part, part, moving, np.ones((len(curves.points), count))) for part in range(parts)
+        (dynamics.order, part, part, dynamics.stencil.own, np.ones((len(curves.points), count)))
+        for part in range(parts)
     ]
     for (part, slot), slope in slopes.items():
-        window = slice(dynamics.reach[0] + slot.offset, dynamics.reach[0] + slot.offset + count)
-        weight = -np.broadcast_to(slope, (len(curves.points), count)) * factor[window]
-        blocks.append((int(slot.name == "v"), part, int(slot.part == "im"), index[window], weight))
+        index, factor = dynamics.stencil.neighbours(slot.vector)
+        weight = -np.broadcast_to(slope, (len(curves.points), count)) * factor
+        blocks.append((int(slot.name == "v"), part, int(slot.part == "im"), index, weight))
     local = curves.basis.basis(curves.points)[0][:, None] + np.arange(curves.basis.degree + 1)
     at = np.arange(len(curves.points))
     rows, columns, data = [], [], []

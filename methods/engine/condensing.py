@@ -74,11 +74,15 @@ def condense(
     weights: Float[ndarray, "time order parts sites"],
     residuals: Float[ndarray, "time order parts sites"] | None = None,
     defects: Float[ndarray, "stretch state"] | None = None,
+    before: Float[ndarray, "time order parts sites"] | None = None,
 ) -> Condensed:
     """Eliminate all states but the first, and then the start and the drive, from the linearised least squares.
 
     Minimises sum (weights * (residuals - change of state))^2 over the changes that follow
     change_{k+1} = (d end / d start) change_k + (d end / d xi) change of xi + defects_k.
+
+    Noise that is correlated from one reading to the next is whitened: `before` times the residual of the last value
+    that was seen of the same number is subtracted from each residual in the sum.
 
     Args:
         stretches: between K + 1 sample times.
@@ -86,15 +90,16 @@ def condense(
         weights: one over the noise of each observed number, 0 where nothing was seen (K + 1, order, parts, N).
         residuals: observed minus present values, likewise; None for 0.
         defects: end of each stretch minus the next state; None for 0.
+        before: factors as `weights`; None where the noise is white.
     """
     dynamics = stretches.dynamics
     size, terms = dynamics.size, transition.by_coefficient.shape[1]
     count = len(transition.end)
     residuals = np.zeros_like(weights) if residuals is None else residuals
     defects = np.zeros((count, size)) if defects is None else defects
-    edge = _edge_rows(stretches, weights[..., dynamics.border], residuals[..., dynamics.border])
-    own = dynamics.moving
-    weights, residuals = (one[..., own].reshape(count + 1, size) for one in (weights, residuals))
+    readings = _Readings(weights, residuals, before)
+    edge = _edge_rows(stretches, readings.at(dynamics.border))
+    readings = readings.at(dynamics.moving).flat(size)
     splines = edge.shape[1] - 1 if edge is not None else 0
     columns = size + splines + terms
     sparse = isinstance(transition.by_state, Sequence) and size > 300
@@ -109,9 +114,9 @@ def condense(
         sums.add_rows(wide)
     local = _local_columns(stretches, transition) if splines else None
     if isinstance(sums, _Triangle):
-        _gather(sums, transition, weights, residuals, defects, splines, local)
+        _gather(sums, transition, readings, defects, splines, local)
     else:
-        _square(sums, transition, weights, residuals, defects, splines, local)
+        _square(sums, transition, readings, defects, splines, local)
     rows, target, solve = sums.reduce(terms)
 
     def start_and_drive(change: ndarray) -> tuple[ndarray, ndarray]:
@@ -124,8 +129,7 @@ def condense(
 def _gather(
     sums: _Triangle,
     transition: Transition,
-    weights: ndarray,
-    residuals: ndarray,
+    readings: _Readings,
     defects: ndarray,
     splines: int,
     local: ndarray | None,
@@ -144,7 +148,7 @@ def _gather(
         kept[number] = z
         if number == block - 1 or k == count:
             now = slice(k - number, k + 1)
-            sums.add(kept[: number + 1], weights[now], residuals[now])
+            sums.add(kept[: number + 1], readings.during(now))
         if k == count:
             break
         z = z @ transition.by_state[k]
@@ -158,8 +162,7 @@ def _gather(
 def _square(
     sums: _Squares,
     transition: Transition,
-    weights: ndarray,
-    residuals: ndarray,
+    readings: _Readings,
     defects: ndarray,
     splines: int,
     local: ndarray | None,
@@ -174,7 +177,7 @@ def _square(
     other = np.zeros((sums.columns + 1 - size, size))
     for k in range(count + 1):
         # The last row of `other` is the effect of the defects.
-        sums.add(state, other, weights[k], residuals[k])
+        sums.add(state, other, readings.during(slice(k, k + 1)))
         if k == count:
             break
         through = transition.by_state[k]
@@ -190,7 +193,7 @@ def _square(
             state.eliminate_zeros()
 
 
-def _edge_rows(stretches: Stretches, weights: ndarray, residuals: ndarray) -> ndarray | None:
+def _edge_rows(stretches: Stretches, readings: _Readings) -> ndarray | None:
     """Return rows that hold the drive to the samples of its sites; the last column is the target."""
     if stretches.drive is None or stretches.held:
         return None
@@ -202,13 +205,15 @@ def _edge_rows(stretches: Stretches, weights: ndarray, residuals: ndarray) -> nd
     blocks = []
     for level in range(dynamics.order):
         for number in range(each):
-            part, site = divmod(number, len(dynamics.border))
-            weight = weights[:, level, part, site]
-            seen = np.flatnonzero(weight > 0)
+            one = readings.at((level, *divmod(number, len(dynamics.border))))
+            seen = np.flatnonzero(one.weights > 0)
             block = np.zeros((len(seen), drive.count * each + 1))
-            block[np.arange(len(seen))[:, None], place[seen] * each + number] = curves[level][seen] * weight[seen, None]
-            block[:, -1] = residuals[seen, level, part, site] * weight[seen]
-            blocks.append(block)
+            block[np.arange(len(seen))[:, None], place[seen] * each + number] = curves[level][seen]
+            block[:, -1] = one.residuals[seen]
+            whitened = block * one.weights[seen, None]
+            if one.before is not None:
+                whitened[1:] -= block[:-1] * one.before[seen[1:], None]
+            blocks.append(whitened)
     return np.concatenate(blocks)
 
 
@@ -218,6 +223,32 @@ def _triangular(rows: ndarray) -> ndarray:
     return np.asarray(factor)
 
 
+@dataclass(frozen=True, eq=False)
+class _Readings:
+    """What is known of the numbers that were read, the times first: `weights`, `residuals`, `before` of `condense`."""
+
+    weights: ndarray
+    residuals: ndarray
+    before: ndarray | None
+
+    def _each(self, change: Callable[[ndarray], ndarray]) -> _Readings:
+        before = None if self.before is None else change(self.before)
+        return _Readings(change(self.weights), change(self.residuals), before)
+
+    def at(self, place: Any) -> _Readings:
+        """Return those of some sites, or of one (level, part, site)."""
+        whole = (slice(None), *place) if isinstance(place, tuple) else (..., place)
+        return self._each(lambda one: one[whole])
+
+    def flat(self, size: int) -> _Readings:
+        """Return each time's in a row."""
+        return self._each(lambda one: one.reshape(len(one), size))
+
+    def during(self, times: slice) -> _Readings:
+        """Return those of some times."""
+        return self._each(lambda one: one[times])
+
+
 class _Triangle:
     """Rows of a least-squares problem, kept as their triangular factor R."""
 
@@ -225,6 +256,8 @@ class _Triangle:
         self.columns = columns
         self.kept: list[ndarray] = []
         self.waiting = 0
+        # The rows of each number when it was last seen.
+        self.last: Any = 0.0
 
     def add_rows(self, rows: ndarray) -> None:
         self.kept.append(rows)
@@ -233,14 +266,25 @@ class _Triangle:
             self.kept = [_triangular(np.concatenate(self.kept))]
             self.waiting = len(self.kept[0])
 
-    def add(self, z: ndarray, weights: ndarray, residuals: ndarray) -> None:
-        """Add the samples at B times: z (B, columns + 1, S), weights and residuals (B, S)."""
+    def add(self, z: ndarray, readings: _Readings) -> None:
+        """Add the samples at B times: z (B, columns + 1, S), readings (B, S)."""
         rows = np.moveaxis(z, 1, 2).copy()
-        rows[..., -1] = residuals - rows[..., -1]
-        rows *= weights[..., None]
-        seen = weights > 0
+        rows[..., -1] = readings.residuals - rows[..., -1]
+        seen = readings.weights > 0
+        earlier = (
+            [] if readings.before is None else [self._passed(one, there) for one, there in zip(rows, seen, strict=True)]
+        )
+        rows *= readings.weights[..., None]
+        if readings.before is not None:
+            rows -= np.stack(earlier) * readings.before[..., None]
         if np.any(seen):
             self.add_rows(rows[seen])
+
+    def _passed(self, rows: ndarray, seen: ndarray) -> Any:
+        """Return the rows when each number was last seen, and keep those that are seen now."""
+        before = self.last
+        self.last = np.where(seen[:, None], rows, before)
+        return np.broadcast_to(before, rows.shape)
 
     def reduce(self, terms: int) -> tuple[ndarray, ndarray, Callable[[ndarray], ndarray]]:
         from scipy.linalg import solve_triangular
@@ -271,6 +315,7 @@ class _Squares:
             import scipy.sparse
 
             self.block = scipy.sparse.csr_array((size, size))
+        self.last: tuple[Any, ndarray] | None = None
         self.across = np.zeros((size, columns - size + 1))
         self.rest = np.zeros((columns - size + 1, columns - size + 1))
 
@@ -278,19 +323,33 @@ class _Squares:
         tail = rows[:, self.size :]
         self.rest += tail.T @ tail
 
-    def add(self, state: Any, other: ndarray, weights: ndarray, residuals: ndarray) -> None:
+    def add(self, state: Any, other: ndarray, readings: _Readings) -> None:
         tail = other.copy()
-        tail[-1] = residuals - tail[-1]
-        tail *= weights
-        if self.sparse:
-            import scipy.sparse
-
-            weighted = state @ scipy.sparse.diags_array(weights, format="csr")
-        else:
-            weighted = state * weights
+        tail[-1] = readings.residuals[0] - tail[-1]
+        weighted, target = self._times(state, readings.weights[0]), tail * readings.weights[0]
+        if readings.before is not None:
+            if self.last is not None:
+                weighted = weighted - self._times(self.last[0], readings.before[0])
+                target -= self.last[1] * readings.before[0]
+            self._pass(state, tail, readings.weights[0] > 0)
         self.block = self.block + weighted @ weighted.T
-        self.across += weighted @ tail.T
-        self.rest += tail @ tail.T
+        self.across += weighted @ target.T
+        self.rest += target @ target.T
+
+    def _times(self, state: Any, factors: ndarray) -> Any:
+        """Return the columns of a matrix times factors."""
+        if not self.sparse:
+            return state * factors
+        import scipy.sparse
+
+        return state @ scipy.sparse.diags_array(factors, format="csr")
+
+    def _pass(self, state: Any, tail: ndarray, seen: ndarray) -> None:
+        """Keep the columns of each number when it was last seen."""
+        if self.last is not None and not np.all(seen):
+            state = self._times(state, seen.astype(float)) + self._times(self.last[0], (~seen).astype(float))
+            tail = np.where(seen, tail, self.last[1])
+        self.last = state, tail
 
     def reduce(self, terms: int) -> tuple[ndarray, ndarray, Callable[[ndarray], ndarray]]:
         import scipy.linalg

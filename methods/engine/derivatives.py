@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latticebench.methods.engine.bsplines import BSplines
 from latticebench.systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
@@ -105,22 +106,22 @@ def _spline(t: ndarray, field: ndarray, *, smooth: bool) -> Smoothed:
     span = t[-1] - t[0]
     x = (t - t[0]) / span
     if smooth:
-        knots = _knots(x)
-        curve = BSpline(knots, _smoothing_coefficients(x, field, knots), DEGREE)
+        basis = _basis(x)
+        curve = BSpline(basis.knots, _smoothing_coefficients(x, field, basis), DEGREE)
     else:
         curve = make_interp_spline(x, field, k=DEGREE)
     return Smoothed(curve(x), curve(x, 1) / span, curve(x, 2) / span**2)
 
 
-def _knots(x: ndarray) -> ndarray:
-    """Return the knots of the quintic spline that interpolates at (at most MAX_COEFFICIENTS of) the sample times."""
+def _basis(x: ndarray) -> BSplines:
+    """Return the basis of quintic splines that interpolate at (at most MAX_COEFFICIENTS of) the sample times."""
     if len(x) > MAX_COEFFICIENTS:
         x = x[np.linspace(0, len(x) - 1, MAX_COEFFICIENTS).round().astype(int)]
     inner = x[DEGREE // 2 + 1 : -(DEGREE // 2 + 1)]
-    return np.concatenate([np.full(DEGREE + 1, x[0]), inner, np.full(DEGREE + 1, x[-1])])
+    return BSplines.clamped(np.concatenate([x[:1], inner, x[-1:]]), DEGREE)
 
 
-def _smoothing_coefficients(x: ndarray, field: ndarray, knots: ndarray) -> ndarray:
+def _smoothing_coefficients(x: ndarray, field: ndarray, splines: BSplines) -> ndarray:
     """Return the c that minimise |field - B c|^2 + weight * integral of (fourth derivative)^2.
 
     The weight is that of least generalised cross-validation. In the basis in which both parts are diagonal the hat
@@ -130,16 +131,15 @@ def _smoothing_coefficients(x: ndarray, field: ndarray, knots: ndarray) -> ndarr
     from scipy.interpolate import BSpline
     from scipy.optimize import minimize_scalar
 
-    basis = BSpline.design_matrix(x, knots, DEGREE)
-    count = basis.shape[1]
+    basis, count = BSpline.design_matrix(x, splines.knots, DEGREE), splines.count
     gram = np.asarray((basis.T @ basis).todense())
     right = np.asarray(basis.T @ field)
     # Two Gauss points per knot interval integrate the square of the fourth derivative, of degree 2, exactly.
     points, weights = np.polynomial.legendre.leggauss(2)
-    edges = np.unique(knots)
+    edges = np.unique(splines.knots)
     middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
     places = (middle[:, None] + half[:, None] * points).ravel()
-    bend = np.asarray(BSpline(knots, np.eye(count), DEGREE)(places, 4))
+    bend = splines.design(places, 4)
     penalty = bend.T @ (bend * (half[:, None] * weights).ravel()[:, None])
     d, modes = scipy.linalg.eigh(penalty, gram)
     d = np.maximum(d, 0.0)

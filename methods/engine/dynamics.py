@@ -13,7 +13,7 @@ steps get shorter.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from latticebench.systems.compiler import Slot, compiled, partials
 from latticebench.systems.errors import InputError
-from latticebench.systems.stencil import Ends, ghosts, observed
+from latticebench.systems.stencil import Ends, Stencil, numbers
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
@@ -73,14 +73,19 @@ class Dynamics:
         return 1 + self.is_complex
 
     @functools.cached_property
+    def stencil(self) -> Stencil:
+        """The sites that all terms read."""
+        return Stencil.chain(self.sites, self.reach, self.ends)
+
+    @functools.cached_property
     def moving(self) -> slice:
         """The sites that have an equation."""
-        return observed(self.sites, self.reach, self.ends)
+        return self.stencil.inner[0]
 
     @functools.cached_property
     def count(self) -> int:
         """The number M of sites that have an equation."""
-        return len(range(*self.moving.indices(self.sites)))
+        return len(self.stencil.own)
 
     @property
     def size(self) -> int:
@@ -90,7 +95,7 @@ class Dynamics:
     @functools.cached_property
     def border(self) -> Int[ndarray, " border"]:
         """The sites that have no equation."""
-        return np.setdiff1d(np.arange(self.sites), np.arange(self.sites)[self.moving])
+        return self.stencil.border
 
     def pack(self, u: ndarray, v: ndarray | None) -> Float[ndarray, "time state"]:
         """Write u (T, N) and, for order 2, v (T, N) as states; a v that is None counts as zero."""
@@ -137,9 +142,9 @@ class Dynamics:
         windows = self._windows(y, t, f, driven)
         shape = (len(t), self.count)
         values = np.empty((self.parts, len(self.terms), *shape))
-        for term, bundle in enumerate(self._values):
+        for bundle, alike in self._values:
             for part, value in enumerate(bundle.function(*(windows(slot) for slot in bundle.slots))):
-                values[part, term] = value
+                values[part, alike] = value
         if self.weights is not None:
             values *= self.weights[:, None, self.moving]
         factors = self._factors(t)
@@ -151,10 +156,33 @@ class Dynamics:
             rate[:, 0] = y.reshape(rate.shape)[:, 1]
         if step is not None and self._rubbing:
             found = self._softened(coefficients, values, rate[:, 0, 0], step, factors, derivatives)
-        rate[:, -1] = np.moveaxis(np.tensordot(coefficients, values, (0, 1)), 0, 1)
+        summed = np.matmul(coefficients, values.reshape(self.parts, len(self.terms), -1))
+        rate[:, -1] = np.moveaxis(summed.reshape(self.parts, *shape), 0, 1)
         if derivatives:
             self._add_slopes(found, windows, coefficients, factors)
         return rate.reshape(y.shape), values, found
+
+    def evaluator(
+        self,
+        t: Float[ndarray, " batch"],
+        y: Float[ndarray, "batch state"],
+        f: Float[ndarray, "batch sites"] | None = None,
+        driven: Float[ndarray, "batch order parts border"] | None = None,
+    ) -> Callable[[Term], Float[ndarray, "batch parts moving"]]:
+        """Return a function that evaluates terms, without weights and factors, at the sites that have an equation.
+
+        The terms must not reach farther than the equation. See `linear` for the arguments and what is raised.
+        """
+        windows = self._windows(y, t, f, driven)
+
+        def value(term: Term) -> ndarray:
+            bundle = compiled((term.text,), self.is_complex)
+            found = np.empty((len(t), self.parts, self.count))
+            for part, one in enumerate(bundle.function(*(windows(slot) for slot in bundle.slots))):
+                found[:, part] = one
+            return found
+
+        return value
 
     def _add_slopes(
         self,
@@ -164,17 +192,24 @@ class Dynamics:
         factors: dict[int, ndarray],
     ) -> None:
         """Add to `found` the derivatives of all terms by the variables of the stencil, times their coefficients."""
-        for term, (slopes, places) in enumerate(self._partials):
-            if not places or coefficients[term] == 0:
+        for (slopes, places), alike in self._partials:
+            acting = [term for term in alike if coefficients[term] != 0]
+            if not places or not acting:
                 continue
             outputs = slopes.function(*(windows(slot) for slot in slopes.slots))
             for (_, part, slot), value in zip(places, outputs, strict=True):
-                share = coefficients[term] * value
-                if self.weights is not None:
-                    share = share * self.weights[term, self.moving]
-                if term in factors:
-                    share = share * factors[term][part]
+                share = self._strength(acting, coefficients, factors, part) * value
                 found[part, slot] = found[part, slot] + share if (part, slot) in found else share
+
+    def _strength(
+        self, terms: Sequence[int], coefficients: ndarray, factors: dict[int, ndarray], part: int
+    ) -> float | ndarray:
+        """Return the sum of coefficient times weight times factor of terms that are the same function."""
+        total: float | ndarray = 0.0
+        for term in terms:
+            own = coefficients[term] if self.weights is None else coefficients[term] * self.weights[term, self.moving]
+            total = total + (own * factors[term][part] if term in factors else own)
+        return total
 
     @functools.cached_property
     def _rubbing(self) -> tuple[int, ...]:
@@ -220,58 +255,47 @@ class Dynamics:
 
     @functools.cached_property
     def _values(self) -> Any:
-        # Each term is compiled once, whatever the equation that it stands in.
-        return [compiled((term.text,), self.is_complex) for term in self.terms]
+        # Each term is compiled once, whatever the equation that it stands in, and evaluated once for all its weights.
+        return [(compiled((text,), self.is_complex), alike) for text, alike in self._alike.items()]
 
     @functools.cached_property
     def _partials(self) -> Any:
-        return [partials((term.text,), self.is_complex) for term in self.terms]
+        return [(partials((text,), self.is_complex), alike) for text, alike in self._alike.items()]
 
     @functools.cached_property
-    def ghosts(self) -> tuple[Int[ndarray, " padded"], Float[ndarray, " padded"]]:
-        """The site that each place of the padded chain repeats, and the factor that it is multiplied by."""
-        return ghosts(self.sites, *self.reach, self.ends)
-
-    @functools.cached_property
-    def _ghosts_are_copies(self) -> bool:
-        return bool(np.all(self.ghosts[1] == 1))
-
-    def padded(self, field: ndarray) -> ndarray:
-        """Extend the last axis, the N sites, by what the ends repeat."""
-        index, factor = self.ghosts
-        if self.ends != "unknown":
-            field = np.take(field, index, axis=-1)
-        return field if self._ghosts_are_copies else field * factor
+    def _alike(self) -> dict[str, list[int]]:
+        """The numbers of the terms that are the same function of the stencil."""
+        found: dict[str, list[int]] = {}
+        for number, term in enumerate(self.terms):
+            found.setdefault(term.text, []).append(number)
+        return found
 
     def whole(self, y: ndarray, driven: ndarray | None) -> ndarray:
         """Return the fields of all sites (..., order, parts, N); the border is 0 where `driven` is None."""
         blocks = y.reshape(*y.shape[:-1], self.order, self.parts, self.count)
         if len(self.border) == 0:
             return blocks
-        left = self.reach[0]
         whole = np.zeros((*blocks.shape[:-1], self.sites))
         whole[..., self.moving] = blocks
         if driven is not None:
-            whole[..., :left] = driven[..., :left]
-            whole[..., self.moving.stop :] = driven[..., left:]
+            whole[..., self.border] = driven
         return whole
 
     def _windows(self, y: ndarray, t: ndarray, f: ndarray | None, driven: ndarray | None) -> Callable[[Slot], Any]:
-        fields = self.padded(self.whole(y, driven))
-        force = None if f is None else self.padded(f)
-        n = (np.arange(self.sites) - (self.sites - 1) / 2)[self.moving]
+        stencil = self.stencil
+        fields = stencil.pad(self.whole(y, driven))
+        force = None if f is None else stencil.pad(f)
 
         def window(slot: Slot) -> Any:
-            first = self.reach[0] + slot.offset
             if slot.name == "t":
                 return t[:, None]
             if slot.name == "n":
-                return n
+                return numbers(self.sites)[self.moving]
             if slot.name == "f":
                 if force is None:
                     raise InputError("the terms use f[n], but there is no measured input")
-                return force[:, first : first + self.count]
-            return fields[:, int(slot.name == "v"), int(slot.part == "im"), first : first + self.count]
+                return force[(slice(None), *stencil.window(slot.vector))]
+            return fields[(slice(None), *slot.place, *stencil.window(slot.vector))]
 
         return window
 

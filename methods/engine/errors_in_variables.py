@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.methods.engine.regression import Regression
+from latticebench.methods.engine.scaled import Scaled
 from latticebench.methods.engine.weak_form import ACCURACY, WeakForm, linearised
 from latticebench.systems.errors import InputError
 
@@ -187,24 +188,8 @@ def _round(
             w[slope.channel] -= slope.matrix.T @ pull[slope.equations].ravel()
         moved_states.append(w)
     stderr = np.zeros(len(found))
-    stderr[support] = _standard_errors(regression.design[:, support]) * np.sqrt(max(chi2, 1.0))
+    stderr[support] = Scaled.of(regression.design[:, support]).stderr() * np.sqrt(max(chi2, 1.0))
     return Estimate(found, stderr, regression, chi2, tuple(moved_states), number, settled=False)
-
-
-def _standard_errors(design: ndarray) -> ndarray:
-    """Return the root of the diagonal of (A^T A)^-1; infinite where a column depends linearly on the others."""
-    scale = np.linalg.norm(design, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    _, values, modes = np.linalg.svd(design / scale, full_matrices=False)
-    if len(values) < design.shape[1] or len(values) == 0:
-        return np.full(design.shape[1], np.inf)
-    with np.errstate(divide="ignore"):
-        spread = np.where(values > 1e-14 * values[0], 1 / values, np.inf)
-    # A mode of infinite spread makes uncertain only the terms that are in it.
-    parts = np.where(np.abs(modes) > 1e-12, np.abs(modes), 0.0)
-    with np.errstate(invalid="ignore"):
-        shares = np.where(parts > 0, parts * spread[:, None], 0.0)
-    return np.asarray(np.sqrt(np.sum(shares**2, axis=0)) / scale)
 
 
 def eliminate(
@@ -239,7 +224,7 @@ def eliminate(
             best_score = score
         if len(left) == 0:
             return best
-        z = np.abs(solution) / _standard_errors(columns[:, left])
+        z = np.abs(solution) / Scaled.of(columns[:, left]).stderr()
         left = np.delete(left, int(np.argmin(z)))
 
 

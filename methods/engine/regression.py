@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from latticebench.methods.engine.derivatives import differentiate
+from latticebench.methods.engine.scaled import lstsq
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
@@ -73,8 +74,7 @@ class Regression:
         coefficients = np.zeros(self.design.shape[1])
         if len(chosen):
             scale = self.scales[chosen]
-            solution = np.linalg.lstsq(self.design[:, chosen] / scale, self.target, rcond=1e-14)[0]
-            coefficients[chosen] = solution / scale
+            coefficients[chosen] = lstsq(self.design[:, chosen], self.target, rcond=1e-14, scale=scale)
         return coefficients
 
 

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 Input = Callable[["ndarray"], "ndarray"]
 
-# Numbers of one stage that are worked on at a time: twelve such arrays stay in the processor's cache.
-CHUNK = 60_000
+# Numbers of one stage that are worked on at a time: fewer cost calls, more leave the processor's cache.
+CHUNK = 200_000
 MAX_SUBSTEPS = 256
 # The largest share of a disturbance that may be left beyond its reach.
 TAIL = 1e-9
@@ -163,15 +163,19 @@ class Stretches:
         splines: ndarray | None = None,
         *,
         by_terms: bool = True,
+        dense: bool = False,
     ) -> Transition:
         """Return the ends of all stretches with their derivatives by the start, the coefficients and the drive.
 
-        Without `by_terms` the derivatives by the coefficients are left out: `by_coefficient` is (K, 0, S).
+        Without `by_terms` the derivatives by the coefficients are left out: `by_coefficient` is (K, 0, S). With `dense`
+        the derivatives by the start are an array on long chains, too.
         """
         dynamics = self.dynamics
         far = 4 * max(1, *dynamics.reach)
         while (colours := self._colours(far)) < dynamics.count:
-            found = self.vary_in_groups(coefficients, start, substeps, splines, colours, far, by_terms=by_terms)
+            found = self.vary_in_groups(
+                coefficients, start, substeps, splines, colours, far, by_terms=by_terms, dense=dense
+            )
             if found is not None:
                 return found
             far *= 2
@@ -184,7 +188,7 @@ class Stretches:
     def _colours(self, far: int) -> int:
         """Return how many groups keep sites of one group more than 2 `far` apart; all sites if that saves little."""
         count, wanted = self.dynamics.count, 2 * far + 1
-        if self.dynamics.ends in ("periodic", "antiperiodic"):
+        if self.dynamics.stencil.is_ring:
             # Round a ring the groups must close up.
             wanted = next((p for p in range(wanted, count) if count % p == 0), count)
         return wanted if 2 * wanted < count else count
@@ -199,6 +203,7 @@ class Stretches:
         far: int,
         *,
         by_terms: bool = True,
+        dense: bool = False,
     ) -> Transition | None:
         """Do the work of `vary` with the sites in groups, those of each disturbed together.
 
@@ -210,6 +215,7 @@ class Stretches:
             colours: number of groups; site n belongs to group n modulo `colours`.
             far: farthest sites, counted from the disturbed one, that are looked at.
             by_terms: see `vary`.
+            dense: see `vary`.
 
         Returns:
             the transition, or None if a disturbance gets farther than `far` sites.
@@ -221,12 +227,9 @@ class Stretches:
         extra = 0
         if self.drive is not None and not self.held:
             extra = self._active[1] * dynamics.parts * len(dynamics.border)
-        seeds = np.zeros((states + terms + extra, size))
-        for block in range(blocks):
-            seeds[block * colours + np.arange(count) % colours, block * count + np.arange(count)] = 1.0
+        seeds = self._seeds(states + terms + extra, colours)
         stretches = len(start)
         end = np.empty_like(start)
-        dense = colours == count
         by_state: Any = np.empty((stretches, states, size))
         by_coefficient = np.empty((stretches, terms, size))
         by_drive = np.empty((stretches, extra, size)) if extra else None
@@ -244,11 +247,19 @@ class Stretches:
                     by_coefficient[chosen] = z[:, states : states + terms]
                     if by_drive is not None:
                         by_drive[chosen] = z[:, states + terms :]
-        if not dense:
-            by_state = _spread(by_state, dynamics, colours, far)
+        if colours < count:
+            by_state = (_spread_dense if dense else _spread)(by_state, dynamics, colours, far)
             if by_state is None:
                 return None
         return Transition(end, by_state, by_coefficient, by_drive, self._active[0] if extra else None)
+
+    def _seeds(self, columns: int, colours: int) -> Float[ndarray, "columns state"]:
+        """Return the derivatives at the start: one row disturbs the sites of one group in one block of the state."""
+        count, blocks = self.dynamics.count, self.dynamics.order * self.dynamics.parts
+        site, seeds = np.arange(count), np.zeros((columns, self.dynamics.size))
+        for block in range(blocks):
+            seeds[block * colours + site % colours, block * count + site] = 1.0
+        return seeds
 
     def _march(
         self,
@@ -324,25 +335,17 @@ class Stretches:
                     column = columns - extra + (place * parts + part) * len(border) + number
                     for level in range(order):
                         field[column, level, part, site, rows] = curves[level]
-        padded = self._padded(field)
+        padded = dynamics.stencil.pad(field, after=1)
         target = out.reshape(columns, order, parts, count, len(t))
         if order == 2:
             target[:, 0] = blocks[:, 1]
         target[:, -1] = 0.0
         for (part, slot), slope in slopes.items():
-            begin = dynamics.reach[0] + slot.offset
-            window = padded[:, int(slot.name == "v"), int(slot.part == "im"), begin : begin + count]
+            window = padded[(slice(None), *slot.place, *dynamics.stencil.window(slot.vector))]
             target[:, -1, part] += (np.atleast_2d(slope).T if np.ndim(slope) else slope) * window
         if by_terms:
             own = columns - extra - terms
             target[own : own + terms, -1] += np.transpose(values, (1, 0, 3, 2))
-
-    def _padded(self, field: ndarray) -> ndarray:
-        """Extend the last axis but one, the N sites, by what the ends repeat."""
-        index, factor = self.dynamics.ghosts
-        if self.dynamics.ends != "unknown":
-            field = np.take(field, index, axis=-2)
-        return field if np.all(factor == 1) else field * factor[:, None]
 
     @functools.cached_property
     def _tableau(self) -> tuple[ndarray, ndarray, ndarray]:
@@ -360,30 +363,61 @@ def _combine(weights: ndarray, slopes: ndarray | None) -> ndarray:
     return np.asarray((weights @ used.reshape(len(weights), -1)).reshape(used.shape[1:]))
 
 
-def _spread(grouped: ndarray, dynamics: Dynamics, colours: int, far: int) -> list[scipy.sparse.csr_array] | None:
-    """Separate the sites of each group.
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Derivatives of sites by sites of their neighbourhood.
 
-    Returns:
-        one sparse (S, S) matrix per stretch, with rows for the start; None where the effects of two sites overlap.
+    Attributes:
+        entries: (pair, stretch, block of the start, block of the end).
+        source, target: the sites of each pair.
     """
+
+    entries: ndarray
+    source: ndarray
+    target: ndarray
+
+    @classmethod
+    def of(cls, grouped: ndarray, dynamics: Dynamics, colours: int, far: int) -> _Pairs | None:
+        """Separate the sites of each group; None where the effects of two sites overlap."""
+        count, blocks = dynamics.count, dynamics.order * dynamics.parts
+        ring = dynamics.stencil.is_ring
+        site = np.arange(count)
+        offset = np.arange(-far, far + 1)
+        source = site[:, None] + offset
+        inside = np.ones(source.shape, dtype=bool) if ring else (source >= 0) & (source < count)
+        target = np.broadcast_to(site[:, None], source.shape)[inside]
+        source = (source % count)[inside]
+        edge = np.abs(np.broadcast_to(offset, inside.shape)[inside]) == far
+        shaped = grouped.reshape(len(grouped), blocks, colours, blocks, count)
+        # NumPy puts the axis of the paired indices first.
+        entries = shaped[:, :, source % colours, :, target]
+        if np.any(edge) and np.max(np.abs(entries[edge]), initial=0.0) > TAIL * np.max(np.abs(entries)):
+            return None
+        return cls(entries, source, target)
+
+
+def _spread(grouped: ndarray, dynamics: Dynamics, colours: int, far: int) -> list[scipy.sparse.csr_array] | None:
+    """Return one sparse (S, S) matrix per stretch, with rows for the start; None where effects overlap."""
     import scipy.sparse
 
-    count, blocks = dynamics.count, dynamics.order * dynamics.parts
-    ring = dynamics.ends in ("periodic", "antiperiodic")
-    site = np.arange(count)
-    offset = np.arange(-far, far + 1)
-    source = site[:, None] + offset
-    inside = np.ones(source.shape, dtype=bool) if ring else (source >= 0) & (source < count)
-    target = np.broadcast_to(site[:, None], source.shape)[inside]
-    source = (source % count)[inside]
-    edge = np.abs(np.broadcast_to(offset, inside.shape)[inside]) == far
-    shaped = grouped.reshape(len(grouped), blocks, colours, blocks, count)
-    entries = shaped[:, :, source % colours, :, target]
-    # NumPy puts the axis of the paired indices first: (pair, stretch, from block, to block).
-    if np.any(edge) and np.max(np.abs(entries[edge]), initial=0.0) > TAIL * np.max(np.abs(entries)):
+    pairs = _Pairs.of(grouped, dynamics, colours, far)
+    if pairs is None:
         return None
+    count, blocks = dynamics.count, dynamics.order * dynamics.parts
     into, out = np.meshgrid(np.arange(blocks), np.arange(blocks), indexing="ij")
-    rows = (into[None] * count + source[:, None, None]).ravel()
-    columns = (out[None] * count + target[:, None, None]).ravel()
+    rows = (into[None] * count + pairs.source[:, None, None]).ravel()
+    columns = (out[None] * count + pairs.target[:, None, None]).ravel()
     shape = (dynamics.size, dynamics.size)
-    return [scipy.sparse.csr_array((entries[:, k].ravel(), (rows, columns)), shape=shape) for k in range(len(grouped))]
+    every = range(len(grouped))
+    return [scipy.sparse.csr_array((pairs.entries[:, k].ravel(), (rows, columns)), shape=shape) for k in every]
+
+
+def _spread_dense(grouped: ndarray, dynamics: Dynamics, colours: int, far: int) -> ndarray | None:
+    """Return the (K, S, S) derivatives of the ends by the start; None where effects overlap."""
+    pairs = _Pairs.of(grouped, dynamics, colours, far)
+    if pairs is None:
+        return None
+    count, blocks = dynamics.count, dynamics.order * dynamics.parts
+    found = np.zeros((len(grouped), blocks, count, blocks, count))
+    found[:, :, pairs.source, :, pairs.target] = pairs.entries
+    return found.reshape(len(grouped), dynamics.size, dynamics.size)

@@ -22,6 +22,7 @@ import numpy as np
 
 from latticebench.methods.engine.condensing import Condensed, condense
 from latticebench.methods.engine.record import Record
+from latticebench.methods.engine.scaled import Scaled
 from latticebench.methods.engine.sensitivity import Stretches, Transition
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ def maximise(
             break
         covariance = step.covariance
         evaluate = functools.partial(side.evaluate, substeps=substeps)
-        found = _shortened(point, step, sigma, float(np.sum(scatter.counts)), evaluate)
+        found = _shortened(records, point, step, sigma, float(np.sum(scatter.counts)), evaluate)
         if found is None:
             break
         length, point = found
@@ -266,6 +267,17 @@ class _Step:
         left = zip(point.defects, self.sizes, strict=True)
         return bool(still and max(float(np.max(np.abs(d) / s, initial=0.0)) for d, s in left) < 0.1)
 
+    def expected(self, records: Sequence[Record], point: _Point, sigma: ndarray) -> float:
+        """Return the sum of squares in units of the noise after the whole step, by the linearised problem."""
+        total = 0.0
+        for record, residual, (nodes, splines) in zip(records, point.residuals, self.moves, strict=True):
+            stretches = record.stretches
+            driven = stretches.driven(record.times, splines) if splines.size else None
+            whole = stretches.dynamics.whole(nodes, driven)
+            left = residual - np.where(record.seen, whole[:, : residual.shape[1]], 0.0)
+            total += float(np.sum(np.sum(left**2, axis=(0, 2, 3)) / sigma**2))
+        return total
+
     def negligible(self, point: _Point) -> bool:
         """Whether the coefficients moved by round-off only: without noise, no step can gain more than that."""
         return bool(np.max(np.abs(self.change)) <= 1e-9 * np.max(np.abs(point.state.coefficients)))
@@ -283,11 +295,12 @@ def _gauss_newton(
         rows = np.concatenate([one.rows for one in condensed])
         if not np.all(np.isfinite(np.sum(rows**2, axis=0))):
             return None
-    change, covariance = _solve(rows, np.concatenate([one.target for one in condensed]))
+    solved = Scaled.of(rows)
+    change = solved.solution(np.concatenate([one.target for one in condensed]))
     if held:
         change = np.zeros_like(change)
     moves = tuple(one.moves(change) for one in condensed)
-    return _Step(change, covariance, moves, tuple(_sizes(record, sigma) for record in records))
+    return _Step(change, solved.covariance(), moves, tuple(_sizes(record, sigma) for record in records))
 
 
 def _condense(record: Record, transition: Transition, weight: ndarray, residual: ndarray, defect: ndarray) -> Condensed:
@@ -299,27 +312,21 @@ def _condense(record: Record, transition: Transition, weight: ndarray, residual:
     return condense(record.stretches, transition, weights, residuals, defect)
 
 
-def _solve(rows: ndarray, target: ndarray) -> tuple[ndarray, ndarray]:
-    """Return the coefficients by least squares and their covariance, which is vast where the samples say nothing."""
-    scale = np.linalg.norm(rows, axis=0)
-    scale[scale == 0] = 1.0
-    left, values, right = np.linalg.svd(rows / scale, full_matrices=False)
-    held = values > 1e-12 * values[0] if len(values) and values[0] > 0 else values > 0
-    inverse = np.where(held, 1 / np.where(held, values, 1.0), 0.0)
-    change = right.T @ (inverse * (left.T @ target)) / scale
-    spread = np.where(held, inverse, 1e12 / max(values[0], 1e-300))
-    covariance = (right.T * spread**2) @ right / scale / scale[:, None]
-    return change, covariance
-
-
 def _shortened(
-    point: _Point, step: _Step, sigma: ndarray, count: float, evaluate: Callable[[State], _Point]
+    records: Sequence[Record],
+    point: _Point,
+    step: _Step,
+    sigma: ndarray,
+    count: float,
+    evaluate: Callable[[State], _Point],
 ) -> tuple[float, _Point] | None:
     """Halve a step until it improves the fit: its length and where it leads, or None where no length does.
 
     The nodes must come to follow the motion first, which short enough steps always achieve; then the samples decide.
+    What the linearised problem expects closing the gap to cost is no reason to go less far.
     """
     gap, chi2 = point.gap(step.sizes), point.chi2(sigma)
+    expected = step.expected(records, point, sigma)
     closed_gap = 1e-4 * count
     # Closing a small gap may cost a little likelihood; the cost vanishes with the gap.
     slack = gap + 10 * np.sqrt(gap * count)
@@ -330,7 +337,8 @@ def _shortened(
         if gap > closed_gap:
             better = near <= max((1 - 0.1 * length) * gap, closed_gap)
         else:
-            better = near <= closed_gap and trial.chi2(sigma) <= chi2 + 1e-3 + slack
+            most = max(chi2, (1 - length) * chi2 + length * expected)
+            better = near <= closed_gap and trial.chi2(sigma) <= most + 1e-3 + slack
         if better:
             return length, trial
         length /= 2

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.methods.engine.bsplines import BSplines
 from latticebench.systems.errors import InputError
 from latticebench.systems.samples import Samples
 
@@ -64,7 +65,7 @@ class SplineState:
 
     def basis(self, t: Float[ndarray, " time"], derivative: int) -> Float[ndarray, "time coefficients"]:
         """Evaluate all B-splines, or a derivative of them."""
-        return _basis(self.knots, self.degree, t, derivative)
+        return BSplines(self.knots, self.degree).design(t, derivative)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +125,7 @@ def estimate_state(samples: Samples, order: int) -> SplineState:
     return SplineState(
         fitted.seen,
         tuple(inverse[id(triangle)] for triangle in fitted.triangles),
-        _knots(t, count - degree, degree),
+        _basis(t, count - degree, degree).knots,
         degree,
         intervals,
         (noise[0], noise[1] if len(noise) > 1 else float("nan")),
@@ -144,15 +145,8 @@ def _size(field: ndarray) -> float:
     return float(np.sqrt(np.nanmean(field**2))) if np.any(~np.isnan(field)) else 0.0
 
 
-def _knots(t: ndarray, intervals: int, degree: int) -> ndarray:
-    inner = np.linspace(t[0], t[-1], intervals + 1)
-    return np.concatenate([np.full(degree, t[0]), inner, np.full(degree, t[-1])])
-
-
-def _basis(knots: ndarray, degree: int, t: ndarray, derivative: int) -> ndarray:
-    from scipy.interpolate import BSpline
-
-    return np.asarray(BSpline(knots, np.eye(len(knots) - degree - 1), degree)(t, derivative))
+def _basis(t: ndarray, intervals: int, degree: int) -> BSplines:
+    return BSplines.clamped(np.linspace(t[0], t[-1], intervals + 1), degree)
 
 
 def _most_intervals(fields: Sequence[ndarray], degree: int) -> int:
@@ -182,8 +176,8 @@ def _spline_fit(
     t: ndarray, fields: Sequence[ndarray], weights: Sequence[float], intervals: int, degree: int, tidy: bool
 ) -> _SplineFit:
     """Fit u, and v as its derivative; channels with the same gaps share one factorisation."""
-    knots = _knots(t, intervals, degree)
-    design = np.concatenate([_basis(knots, degree, t, k) * weight for k, weight in enumerate(weights)])
+    basis = _basis(t, intervals, degree)
+    design = np.concatenate([basis.design(t, k) * weight for k, weight in enumerate(weights)])
     target = np.concatenate([field * weight for field, weight in zip(fields, weights, strict=True)])
     count = design.shape[1]
     height = np.sqrt(np.mean(np.sum(design**2, axis=0)))

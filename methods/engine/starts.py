@@ -17,6 +17,7 @@ from latticebench.methods.engine.border import fit_border
 from latticebench.methods.engine.derivatives import DEGREE, differentiate
 from latticebench.methods.engine.errors_in_variables import sparse_estimate
 from latticebench.methods.engine.record import Record
+from latticebench.methods.engine.scaled import lstsq
 from latticebench.methods.engine.shooting import State, maximise
 from latticebench.methods.engine.weak_form import WeakForm
 from latticebench.systems.errors import InputError
@@ -121,10 +122,8 @@ def _carrying(records: Sequence[Record], state: State) -> Float[ndarray, " terms
         designs.append(np.moveaxis(total[window:] - total[:-window], 2, -1).reshape(-1, values.shape[1]))
         targets.append((rate[window:] - rate[:-window]).ravel())
     design, target = np.concatenate(designs), np.concatenate(targets)
-    scale = np.sqrt(np.mean(design**2, axis=0))
-    scale[scale == 0] = 1.0
     # Directions that the smoothed states barely show start at 0; the fit finds them.
-    return np.asarray(np.linalg.lstsq(design / scale, target, rcond=1e-4)[0] / scale)
+    return lstsq(design, target, rcond=1e-4)
 
 
 def from_weak_form(

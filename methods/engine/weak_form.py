@@ -23,17 +23,18 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latticebench.methods.engine.inputs import inputs
 from latticebench.methods.engine.spline_state import estimate_state
 from latticebench.systems.compiler import partials
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
-from latticebench.systems.stencil import evaluate, ghosts, observed
+from latticebench.systems.stencil import Stencil, evaluate, numbers
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -123,19 +124,20 @@ class WeakForm:
         self.tests = bumps(self.grid, centres, support, power) * (self.grid[1] - self.grid[0])
         self.value = state.basis(self.grid, 0)
         self.rate = state.basis(self.grid, 1)
-        self.index, self.factor = ghosts(samples.sites, *library.reach, samples.ends)
-        inner = np.arange(samples.sites)[observed(samples.sites, library.reach, samples.ends)]
+        self.stencil = Stencil.chain(samples.sites, library.reach, samples.ends)
         whole = state.whole if samples.f is None else state.whole & (np.sum(~np.isnan(samples.f), axis=0) > 1)
-        width = 1 + sum(library.reach)
-        stencils = [whole[self.index[k : k + width]] | (self.factor[k : k + width] == 0) for k in range(len(inner))]
-        self.kept = np.flatnonzero([bool(np.all(stencil)) for stencil in stencils])
-        self.sites = inner[self.kept]
+        read = [self.stencil.neighbours(offset) for offset in self.stencil.offsets]
+        self.kept = np.flatnonzero(np.all([whole[place] | (factor == 0) for place, factor in read], axis=0))
+        self.sites = self.stencil.own[self.kept]
         if len(self.sites) == 0:
             raise InputError(
                 f"{samples.source}: no site has its whole stencil seen more than {state.degree} times; "
                 "there are too many missing values or too few sites"
             )
-        self.input = None if samples.f is None else _interpolate(t, samples.f, self.grid, whole)
+        # At sites that are not used there may be no input at all.
+        self.input = (
+            None if samples.f is None else inputs(replace(samples, f=np.where(whole, samples.f, 0.0)), self.grid)
+        )
         self.partials = partials(library.texts, samples.is_complex)
 
     @property
@@ -173,11 +175,12 @@ class WeakForm:
         """Return the derivative of the residual of the weak equations by the state, one piece per channel."""
         profiles: defaultdict[int, dict[int, dict[str, ndarray]]] = defaultdict(dict)
         for (part, slot), slope in self._derivatives(w, coefficients).items():
-            for k, place in enumerate(self.kept + self.library.reach[0] + slot.offset):
-                if self.factor[place]:
-                    channel = int(self.index[place]) * self.parts + (slot.part == "im")
+            places, factors = self.stencil.neighbours(slot.vector)
+            for k, (place, factor) in enumerate(zip(places[self.kept], factors[self.kept], strict=True)):
+                if factor:
+                    channel = int(place) * self.parts + (slot.part == "im")
                     one = profiles[channel].setdefault(k * self.parts + part, {})
-                    one[slot.name] = one.get(slot.name, 0) + self.factor[place] * slope[:, k]
+                    one[slot.name] = one.get(slot.name, 0) + factor * slope[:, k]
         own = (self.sites[:, None] * self.parts + np.arange(self.parts)).ravel()
         for equation, channel in enumerate(own):
             profiles[int(channel)].setdefault(equation, {})
@@ -202,7 +205,7 @@ class WeakForm:
         bundle, places = self.partials
         u, v = self.fields(w)
         shape = (len(self.grid), len(self.sites))
-        n = (np.arange(self.samples.sites) - (self.samples.sites - 1) / 2)[self.sites]
+        n = numbers(self.samples.sites)[self.sites]
         arrays: list[ndarray] = []
         for slot in bundle.slots:
             if slot.name in ("t", "n"):
@@ -210,8 +213,8 @@ class WeakForm:
                 continue
             field = {"u": u, "v": v, "f": self.input}[slot.name]
             assert field is not None
-            place = self.kept + self.library.reach[0] + slot.offset
-            window = field[:, self.index[place]] * self.factor[place]
+            place, factor = (one[self.kept] for one in self.stencil.neighbours(slot.vector))
+            window = field[:, place] * factor
             arrays.append(window.imag if slot.part == "im" else window.real)
         found: dict[tuple[int, Any], ndarray] = {}
         if places and np.any(coefficients):
@@ -228,20 +231,9 @@ class WeakForm:
         """Return an order in which equations that share channels are near each other; a ring is folded."""
         sites = len(self.sites)
         rank = np.arange(sites)
-        if self.samples.ends in ("periodic", "antiperiodic"):
+        if self.stencil.is_ring:
             rank = np.minimum(2 * rank, 2 * (sites - 1 - rank) + 1)
         return np.asarray((rank[:, None] * self.parts + np.arange(self.parts)).ravel())
-
-
-def _interpolate(t: ndarray, f: ndarray, grid: ndarray, whole: ndarray) -> ndarray:
-    """Evaluate a measured input on the grid by cubic splines through its samples; 0 at sites that are not used."""
-    from scipy.interpolate import make_interp_spline
-
-    result = np.zeros((len(grid), f.shape[1]))
-    for site in np.flatnonzero(whole):
-        seen = ~np.isnan(f[:, site])
-        result[:, site] = make_interp_spline(t[seen], f[seen, site], k=min(3, int(np.sum(seen)) - 1))(grid)
-    return result
 
 
 class Covariance:

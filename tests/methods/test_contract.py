@@ -142,6 +142,9 @@ def test_an_unknown_setting_and_a_value_of_another_type_are_refused_by_name(name
     with pytest.raises(InputError, match="unknown setting 'thresold'"):
         make(kind, {"thresold": 1})
     numbers = [key for key, value in settings(kind).items() if isinstance(value, float)]
+    for key in numbers:
+        with pytest.raises(InputError, match=f"setting {key} = True"):
+            make(kind, {key: True})
     for key in numbers[:1]:
         with pytest.raises(InputError, match=f"setting {key} = 'many'"):
             make(kind, {key: "many"})

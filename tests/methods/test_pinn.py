@@ -11,8 +11,8 @@ import pytest
 from latticebench import systems
 from latticebench.methods.engine.inputs import inputs
 from latticebench.methods.method import make, solve
+from latticebench.methods.pielm import PIELM
 from latticebench.methods.pinn import PINN
-from latticebench.methods.pinn_vp import PINNVP
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -149,7 +149,7 @@ def test_unsound_settings_are_named(name, value):
         make(PINN, {name: value})
 
 
-@pytest.mark.parametrize("kind", [PINN, PINNVP])
+@pytest.mark.parametrize("kind", [PINN, PIELM])
 @pytest.mark.parametrize("device", ["nonesuch", "cuda"])
 def test_a_device_that_is_not_there_is_told_in_one_line(kind, device):
     torch = pytest.importorskip("torch")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from latticebench.systems.errors import InputError
-from latticebench.systems.stencil import Stencil, evaluate, ghosts, observed
+from latticebench.systems.stencil import Stencil, evaluate, ghosts, numbers, observed
 from latticebench.systems.terms import Term, split
 
 ENDS = ("free", "fixed", "periodic", "antiperiodic")
@@ -36,13 +36,33 @@ def test_ghosts_agree_with_the_definitions_of_the_ends(neighbour, ends, count, l
 @pytest.mark.parametrize("ends", ["unknown", *ENDS])
 def test_a_window_shows_each_inner_site_its_neighbour(neighbour, ends):
     u = np.random.default_rng(1).normal(size=(2, 7))
-    stencil = Stencil(7, (2, 1), ends)
-    assert stencil.inner == observed(7, (2, 1), ends)
+    stencil = Stencil.chain(7, (2, 1), ends)
     inner = np.arange(7)[stencil.inner]
-    np.testing.assert_array_equal(stencil.numbers, inner - 3)
-    for offset in (-2, -1, 0, 1):
-        seen = stencil.pad(u)[:, stencil.window(offset)]
-        np.testing.assert_array_equal(seen, [[neighbour(row, k + offset, ends) for k in inner] for row in u])
+    np.testing.assert_array_equal(stencil.own, np.arange(7)[observed(7, (2, 1), ends)])
+    np.testing.assert_array_equal(inner, stencil.own)
+    np.testing.assert_array_equal(stencil.border, [] if ends != "unknown" else [0, 1, 6])
+    np.testing.assert_array_equal(numbers(7)[stencil.own], inner - 3)
+    assert stencil.offsets == ((-2,), (-1,), (0,), (1,))
+    for offset in stencil.offsets:
+        wanted = [[neighbour(row, k + offset[0], ends) for k in inner] for row in u]
+        np.testing.assert_array_equal(stencil.pad(u)[(slice(None), *stencil.window(offset))], wanted)
+        np.testing.assert_array_equal(stencil.pad(u.T, after=1)[stencil.window(offset)].T, wanted)
+        place, factor = stencil.neighbours(offset)
+        np.testing.assert_array_equal(u[:, place] * factor, wanted)
+
+
+@pytest.mark.parametrize("ends", ["unknown", *ENDS])
+def test_a_lattice_of_two_axes_is_read_along_each_as_a_chain_is(neighbour, ends):
+    u = np.random.default_rng(1).normal(size=(4, 5))
+    stencil = Stencil((4, 5), ((1, 0), (1, 2)), ends)
+    assert len(stencil.offsets) == 2 * 4
+    inner = [(i, k) for i in range(4)[stencil.inner[0]] for k in range(5)[stencil.inner[1]]]
+    np.testing.assert_array_equal(stencil.own, [5 * i + k for i, k in inner])
+    for down, right in stencil.offsets:
+        wanted = [neighbour([neighbour(row, k + right, ends) for row in u], i + down, ends) for i, k in inner]
+        np.testing.assert_array_equal(stencil.pad(u)[stencil.window((down, right))].ravel(), wanted)
+        place, factor = stencil.neighbours((down, right))
+        np.testing.assert_array_equal(u.ravel()[place] * factor, wanted)
 
 
 def test_unknown_ends_use_only_sites_whose_whole_stencil_was_observed():

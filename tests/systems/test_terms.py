@@ -224,3 +224,10 @@ def test_express_gives_back_what_a_combination_was_made_of(numbers):
     found = express(Term(text), terms, False)
     scale = max(abs(number) for number in numbers)
     np.testing.assert_allclose(found, numbers, rtol=1e-10, atol=1e-11 * scale)
+
+
+def test_the_parity_of_a_sine_of_a_large_multiple_is_known_at_once():
+    # SymPy's simplification of it does not come to an end.
+    assert Term("sin(1024*u[n])").parity == -1
+    assert Term("cos(4096*u[n])").parity == 1
+    assert Term("sin(u[n])**2+cos(u[n])**2-1").parity == 1

@@ -70,3 +70,20 @@ def test_a_record_in_pieces_is_fitted_as_the_pieces_are_one_by_one():
     np.testing.assert_allclose(one.state.coefficients, other.state.coefficients, rtol=1e-12)
     for left, right in zip(one.state.nodes, other.state.nodes, strict=True):
         np.testing.assert_allclose(left, right, rtol=1e-9, atol=1e-12)
+
+
+def test_states_of_dense_samples_follow_the_motion_within_a_few_steps():
+    """Closing the small gaps between them costs likelihood at first, and is no reason for shorter and shorter steps."""
+    system = systems.find("phi4")
+    clean = simulate(system, sites=9, times=np.linspace(0, 10, 401))
+    samples = observe(clean, np.random.default_rng(0), noise=0.01).observed()
+    samples = replace(samples, v=None, ends=system.ends)
+    library = system.library("lib2")
+    records = [prepare(samples, library.terms, 2)]
+    start = guess([samples], records)
+    held = maximise(records, replace(start, coefficients=system.truth(library, {})), tolerance=0.1, held=True)
+    assert held.converged
+    assert len(held.steps) <= 5
+    free = maximise(records, held.state)
+    assert free.converged
+    assert len(free.steps) <= 6
