@@ -1,11 +1,15 @@
 """The statistical limit: how accurately any method could know the coefficients from given samples.
 
-For samples y = u(t) + noise (independent, Gaussian, sigma known) of a motion with unknown start, no unbiased estimate
-has a covariance below the inverse of the Fisher matrix sum (d y/d p)^T (d y/d p) / sigma^2. The parameters p are the
+For samples y = u(t) + noise of a motion with unknown start, no unbiased estimate has a covariance below the inverse of
+the Fisher matrix (d y/d p)^T C^-1 (d y/d p), where C is the covariance of the noise. The parameters p are the
 coefficients, the whole initial state and, at unknown ends, the splines that the sites without an equation follow
 (Cramer, Mathematical Methods of Statistics (1946), section 32.3; Rao, Bull. Calcutta Math. Soc. 37, 81 (1945)). The
 derivatives come from the variational equations (`latticebench.methods.engine.sensitivity`). The bound is proportional
 to the noise.
+
+Noise has the model of `latticebench.diagnosis.noise`, whose innovations make C diagonal. Where they follow Student's t
+with nu degrees of freedom and scale s, each has (nu + 1) / (nu + 3) / s^2 in place of 1 / s^2 (Lange, Little & Taylor,
+J. Am. Stat. Assoc. 84, 881, 1989). That noise which grows with the signal tells something about it is left out.
 
 Values that were not observed (NaN in the data) carry no weight. A measured input counts as known; between its samples
 it is their cubic spline.
@@ -22,9 +26,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.methods.engine.bsplines import BSplines
+from latticebench.bench.noise import fields_of, left_by, readings, rows_of
+from latticebench.diagnosis.noise import Noise, Structure
+from latticebench.methods.engine.bsplines import BSplines, through
 from latticebench.methods.engine.condensing import condense
 from latticebench.methods.engine.dynamics import Dynamics, split_parts
+from latticebench.methods.engine.scaled import Scaled
 from latticebench.methods.engine.sensitivity import Stretches
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
@@ -44,6 +51,8 @@ ROUGH = 0.5
 TOGETHER = 0.9
 # Larger groups are counted instead of listed in a verdict.
 LISTED = 4
+# Directions that the samples do not show count as known to this share of the best known one.
+LEAST = 1e-13
 DEGREE = 5
 
 
@@ -226,10 +235,13 @@ def bound_of(data: Sequence[SimulatedSamples], library: Library, order: int, *, 
     return bound_along(data, motion, library, order, truth, noise=noise)
 
 
-def bound_of_fit(data: Sequence[Samples], fit: Fit) -> Limit:
-    """Return the bound for measured samples, along the motion of a fit, with its coefficients and its noise.
+def bound_of_fit(data: Sequence[Samples], fit: Fit, noise: Noise | None = None) -> Limit:
+    """Return the bound for measured samples, along the motion of a fit, with its coefficients.
 
-    The noise is what the fit leaves, including errors of the model.
+    Args:
+        data: the samples.
+        fit: whose motion is followed.
+        noise: of each sensor; None for what the fit leaves (`bench.noise.left_by`), including errors of the model.
 
     Raises:
         InputError: the fit has no motion.
@@ -238,8 +250,8 @@ def bound_of_fit(data: Sequence[Samples], fit: Fit) -> Limit:
         raise InputError(
             f"{data[0].source}: method {fit.method!r} follows no motion, along which a bound could be taken"
         )
-    sizes = [float(fit.found[name]) for name in ("noise_u", "noise_v") if name in fit.found]
-    return bound_along(data, fit.motion, fit.library, fit.order, fit.coefficients, sizes=sizes)
+    noise = left_by(data, fit).noise if noise is None else noise
+    return bound_along(data, fit.motion, fit.library, fit.order, fit.coefficients, noise=noise)
 
 
 def bound_along(
@@ -249,8 +261,7 @@ def bound_along(
     order: int,
     coefficients: Float[ndarray, " terms"],
     *,
-    noise: float = 0.01,
-    sizes: Sequence[float] | None = None,
+    noise: float | Noise = 0.01,
 ) -> Limit:
     """Return the bound along trajectories whose exact states are known (simulated or fitted).
 
@@ -261,25 +272,22 @@ def bound_along(
         library: the terms.
         order: of the time derivative.
         coefficients: of the equation that the motion follows.
-        noise: sigma over the RMS of each field about its mean.
-        sizes: standard deviations of the noise on each real part of u and of v, in place of `noise`.
+        noise: of each sensor, u before v; or a number, sigma over the RMS of each field about its mean.
 
     Raises:
         InputError: the noise is not a positive number, v is not known, or an input is missing.
     """
-    if sizes is None and not (np.isfinite(noise) and noise > 0):
+    if not isinstance(noise, Noise) and not (np.isfinite(noise) and noise > 0):
         raise InputError(f"noise: {noise!r} must be a number above 0 (0.01 for one per cent)")
-    pieces = [
-        _along(one, exact, library, order, coefficients, noise if sizes is None else tuple(sizes))
-        for one, exact in zip(data, motion, strict=True)
-    ]
+    pieces = [_along(one, exact, library, order, coefficients, noise) for one, exact in zip(data, motion, strict=True)]
     design = np.concatenate([one.values for one in pieces])
     columns = np.linalg.norm(design, axis=0)
     columns[columns == 0] = 1.0
     values = np.linalg.svd(design / columns, compute_uv=False)
     height = np.linalg.norm(np.concatenate([one.rate for one in pieces]))
+    covariance = Scaled.of(np.concatenate([one.rows for one in pieces])).covariance(LEAST)
     return Limit(
-        library, np.asarray(coefficients, dtype=float), _inverse(np.concatenate([one.rows for one in pieces])),
+        library, np.asarray(coefficients, dtype=float), covariance,
         columns / max(height, 1e-300), float(values[0] / max(values[-1], 1e-300)),
         float(np.mean([one.level for one in pieces])), sum(len(one.t) for one in data),
         max(float(one.t[-1] - one.t[0]) for one in data),
@@ -305,7 +313,7 @@ class _Along:
 
 
 def _along(
-    one: Samples, exact: Samples, library: Library, order: int, coefficients: ndarray, noise: float | tuple[float, ...]
+    one: Samples, exact: Samples, library: Library, order: int, coefficients: ndarray, noise: float | Noise
 ) -> _Along:
     if order == 2 and exact.v is None:
         raise InputError(f"{one.source}: the bound needs the velocities of the exact motion")
@@ -314,9 +322,10 @@ def _along(
     force = one.forcing() if library.uses("f") else None
     stretches = Stretches(dynamics, exact.t[:-1], exact.t[1:], force, drive)
     nodes = dynamics.pack(exact.u, exact.v)
-    weight, level = _weights(one, exact, dynamics, noise)
+    noise = noise if isinstance(noise, Noise) else _white(one, exact, noise, dynamics)
+    weights, before, level = _whitening(one, exact, dynamics, noise)
     steps = stretches.substeps(coefficients, nodes[:-1], 1e-6 * float(np.max(np.abs(nodes))), splines)
-    found = condense(stretches, stretches.vary(coefficients, nodes[:-1], steps, splines), weight)
+    found = condense(stretches, stretches.vary(coefficients, nodes[:-1], steps, splines), weights, before=before)
     f = None if force is None else force(exact.t)
     driven = stretches.driven(exact.t, splines)
     rate, values, _ = dynamics.linear(coefficients, exact.t, nodes, f, driven, derivatives=False)
@@ -328,53 +337,61 @@ def _along(
     )
 
 
-def _weights(
-    one: Samples, exact: Samples, dynamics: Dynamics, noise: float | tuple[float, ...]
-) -> tuple[Float[ndarray, "time order parts sites"], float]:
-    """Return one over the noise of each observed number, and the noise level of u.
+def _white(one: Samples, exact: Samples, level: float, dynamics: Dynamics) -> Noise:
+    """Return white noise of one level; a complex field shares it between both parts."""
+    sizes = [
+        noise_size(field, level) / np.sqrt(dynamics.parts) for field in fields_of(_like(one, exact), dynamics.order)
+    ]
+    size = np.repeat(sizes, dynamics.sites)
+    return Noise(size, 0.0, np.inf, np.zeros(len(size)), Structure())
+
+
+def _whitening(
+    one: Samples, exact: Samples, dynamics: Dynamics, noise: Noise
+) -> tuple[Float[ndarray, "time order parts sites"], Float[ndarray, "time order parts sites"] | None, float]:
+    """Return `weights` and `before` of `condense` for each observed number, and the noise level of u.
 
     Args:
         one: the samples; what is NaN in them weighs nothing.
         exact: their motion.
         dynamics: the equation.
-        noise: the noise level, or the standard deviations of the noise on each real part of u and of v.
+        noise: of each sensor.
     """
-    # A complex field shares its noise between both parts.
-    share = np.sqrt(dynamics.parts)
-    weight = np.zeros((len(exact.t), dynamics.order, dynamics.parts, dynamics.sites))
-    level = 0.0
-    for number, (states, seen) in enumerate([(exact.u, one.u), (exact.v, one.v)][: dynamics.order]):
-        if seen is None:
-            continue
-        assert states is not None
-        size = noise[number] if isinstance(noise, tuple) else noise_size(states, noise) / share
-        if not (np.isfinite(size) and size > 0 and noise_size(states, 1.0) > 0):
-            raise InputError(f"{one.source}: nothing moves, or nothing is left to noise: there is no bound")
-        weight[:, number] = (np.isfinite(seen) / size)[:, None]
-        if number == 0:
-            level = float(size * share / noise_size(states, 1.0))
-    return weight, level
+    seen = np.isfinite(readings(one, dynamics.order))
+    level, rows = readings(_like(one, exact), dynamics.order), rows_of([one], dynamics.order)
+    height = noise_size(exact.u, 1.0)
+    if not (np.all(np.isfinite(noise.size)) and np.all(noise.size > 0) and height > 0):
+        raise InputError(f"{one.source}: nothing moves, or nothing is left to noise: there is no bound")
+    whitener = noise.whitener(level, rows, seen)
+    told = np.sqrt((noise.tail + 1) / (noise.tail + 3)) if np.isfinite(noise.tail) else 1.0
+
+    def arranged(factors: ndarray) -> ndarray:
+        flat = np.zeros(seen.size)
+        flat[whitener.chain.where] = told * factors
+        found = np.zeros((len(seen), dynamics.order, dynamics.parts * dynamics.sites))
+        own = flat.reshape(seen.T.shape).T.reshape(len(seen), -1, found.shape[2])
+        found[:, : own.shape[1]] = own
+        return found.reshape(len(seen), dynamics.order, dynamics.parts, dynamics.sites)
+
+    # Of Student's t the standard deviation is larger than the scale.
+    heavier = (noise.deviation() / noise.size)[rows.sensor]
+    spread = (heavier * np.hypot(noise.size[rows.sensor], noise.growth * level))[:, rows.sensor < dynamics.sites]
+    noisy = float(np.sqrt(np.mean(spread**2) * dynamics.parts) / height)
+    return arranged(whitener.own), arranged(whitener.before) if np.any(whitener.before) else None, noisy
+
+
+def _like(one: Samples, exact: Samples) -> Samples:
+    """Return a motion without velocities where none were observed."""
+    return replace(exact, v=None) if one.v is None else exact
 
 
 def _drive(exact: Samples, dynamics: Dynamics) -> tuple[BSplines | None, ndarray | None]:
     """Return splines with one coefficient per sample through the exact motion of the sites without an equation."""
-    from scipy.interpolate import make_interp_spline
-
     if len(dynamics.border) == 0:
         return None, None
     if len(exact.t) <= DEGREE:
         raise InputError(f"unknown ends need at least {DEGREE + 1} samples")
-    curve = make_interp_spline(exact.t, split_parts(exact.u[:, dynamics.border], dynamics.is_complex), k=DEGREE)
-    return BSplines(curve.t, DEGREE), curve.c
-
-
-def _inverse(rows: ndarray) -> ndarray:
-    """Return (rows^T rows)^-1, very large in directions that the samples do not show at all."""
-    scale = np.linalg.norm(rows, axis=0)
-    scale[scale == 0] = 1.0
-    _, values, right = np.linalg.svd(rows / scale, full_matrices=False)
-    spread = 1 / np.maximum(values, 1e-13 * max(values[0], 1e-300))
-    return np.asarray((right.T * spread**2) @ right / scale / scale[:, None])
+    return through(exact.t, split_parts(exact.u[:, dynamics.border], dynamics.is_complex), DEGREE)
 
 
 def design(bound_at: Callable[[int, int], Limit], *, target: float = 0.01, doublings: int = 4) -> Design:
@@ -420,7 +437,7 @@ def design(bound_at: Callable[[int, int], Limit], *, target: float = 0.01, doubl
     )  # fmt: skip
 
 
-def denser(data: Sequence[Samples], fit: Fit, times: int) -> Limit:
+def denser(data: Sequence[Samples], fit: Fit, times: int, noise: Noise | None = None) -> Limit:
     """Return the bound of `bound_of_fit` for `times` as many samples of the same motion in the same time.
 
     Between the sample times the fitted motion is its spline of degree 5; no value is missing there.
@@ -429,7 +446,8 @@ def denser(data: Sequence[Samples], fit: Fit, times: int) -> Limit:
         InputError: as for `bound_of_fit`, or there are too few samples for a spline.
     """
     if times == 1 or fit.motion is None:
-        return bound_of_fit(data, fit)
+        return bound_of_fit(data, fit, noise)
+    noise = left_by(data, fit).noise if noise is None else noise
     seen, motion = [], []
     for one, exact in zip(data, fit.motion, strict=True):
         t = np.interp(np.arange((len(one.t) - 1) * times + 1) / times, np.arange(len(one.t)), one.t)
@@ -437,13 +455,12 @@ def denser(data: Sequence[Samples], fit: Fit, times: int) -> Limit:
         f = None if one.f is None else one.forcing()(t)
         motion.append(replace(exact, t=t, u=u, v=v, f=f))
         seen.append(replace(motion[-1], v=None if one.v is None else v))
-    return bound_of_fit(seen, replace(fit, motion=tuple(motion)))
+    return bound_of_fit(seen, replace(fit, motion=tuple(motion)), noise)
 
 
 def _between(t: ndarray, field: ndarray, at: ndarray) -> ndarray:
     """Interpolate a motion in time."""
-    from scipy.interpolate import make_interp_spline
-
     if len(t) <= DEGREE:
         raise InputError(f"a motion of {len(t)} samples cannot be interpolated; at least {DEGREE + 1} are needed")
-    return np.asarray(make_interp_spline(t, field, k=DEGREE)(at))
+    basis, coefficients = through(t, field, DEGREE)
+    return np.asarray(basis.design(at, 0) @ coefficients)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from latticebench.bench.cli.arguments import asked, case_of, numbers, told
-from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, complete_systems
+from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, Yes, check_places, complete_systems
 from latticebench.bench.cli.options import Library as LibraryName
 from latticebench.systems.errors import InputError
 
@@ -53,19 +53,20 @@ def limit(
     samples: Annotated[int | None, typer.Option(help="Number of sample times; 50 if not given.")] = None,
     span: Annotated[float | None, typer.Option(help="Length of the record; 10 if not given.")] = None,
     noise: Annotated[
-        float | None,
-        typer.Option(help="Noise level: sigma over the RMS of the field about its mean; 0.01 if not given."),
+        float | None, typer.Option(help="Noise level: sigma over the RMS about the mean; 0.01 if not given.")
     ] = None,
     trajectories: Annotated[int | None, typer.Option(help="Number of trajectories; 1 if not given.")] = None,
     velocities: Annotated[bool | None, typer.Option(help="Whether velocities are seen (second-order systems).")] = None,
     initial: Annotated[str | None, typer.Option(help="Initial state; the system's first if not given.")] = None,
     json_out: JsonOut = None,
+    yes: Yes = False,
 ) -> None:
     """Show how well any method could know the coefficients from such samples, and what would be needed for more.
 
     Options from --set to --initial are about samples of a system; of recorded ones everything is known but their
-    noise, which is taken from a fit.
+    noise, which is what a fit leaves at each sensor.
     """
+    check_places([*(files or ()), system], json=json_out)
     known, candidates, order = asked(system, library, terms, order)
     simulated = {
         "set": given, "sites": sites, "samples": samples, "span": span, "noise": noise,
@@ -85,7 +86,7 @@ def limit(
             terms=candidates.texts if terms is not None else (), ends=None if ends == "unknown" else ends,
             **{"noise": 0.01, **described},
         )  # fmt: skip
-        note, bound_at = _of_simulated(case)
+        note, bound_at = _of_simulated(case, None if yes else case.sites or known.sites)
     _report(note, bound_at, target, json_out)
 
 
@@ -96,23 +97,25 @@ BoundAt = Callable[[int, int], "Limit"]
 def _of_recordings(files: Sequence[Path], candidates: Library, order: int, ends: AnyEnds) -> tuple[str, BoundAt]:
     """Return where the bound of recorded samples is taken, and the bound."""
     from latticebench.bench.limit import denser
+    from latticebench.bench.noise import left_by
     from latticebench.bench.report.screen import waiting
     from latticebench.systems.readers import read_all
 
     data = read_all(files, ends)
     with waiting(f"fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
         fit = _followed(data, candidates, order)
+    left = left_by(data, fit)
 
     def bound_at(more: int, longer: int) -> Limit:
         if longer > 1:
             raise InputError("nobody knows how the motion goes on after the record")
-        return denser(data, fit, more)
+        return denser(data, fit, more, left.noise)
 
     note = (
         f"{data[0].source}: bound along the motion that {fit.method!r} fits to the samples, with the noise that it "
-        "leaves"
+        "leaves" + ("" if fit.status == "ok" else f" ({fit.status})")
     )
-    return note + ("" if fit.status == "ok" else f" ({fit.status})"), bound_at
+    return "\n".join([note, *(f"noise of {line}" for line in left.lines), *left.warning]), bound_at
 
 
 def _followed(data: Sequence[Samples], candidates: Library, order: int) -> Fit:
@@ -125,9 +128,13 @@ def _followed(data: Sequence[Samples], candidates: Library, order: int) -> Fit:
         return solve(method, data, candidates, order, 1)
 
 
-def _of_simulated(case: FitCase) -> tuple[str, BoundAt]:
-    """Return where the bound of simulated samples is taken, and the bound."""
+def _of_simulated(case: FitCase, sites: int | None) -> tuple[str, BoundAt]:
+    """Return where the bound of simulated samples is taken, and the bound; without `sites` they may be any size."""
+    from latticebench.bench.effort import check_size
     from latticebench.bench.fitting import bound
+
+    if sites is not None:
+        check_size(case, sites, case.system)
 
     def bound_at(more: int, longer: int) -> Limit:
         changed = {"samples": case.samples * more * longer, "span": case.span * longer}

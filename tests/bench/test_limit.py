@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from latticebench import systems
 from latticebench.bench.limit import Limit, bound_along, bound_of, bound_of_fit, denser, design
+from latticebench.diagnosis.noise import Noise, Structure
 from latticebench.methods.method import solve
 from latticebench.methods.trajectory import Trajectory
 from latticebench.systems.errors import InputError
@@ -144,6 +145,10 @@ def test_values_that_are_missing_tell_nothing():
     assert np.all(bound_of([gaps], one, 2, noise=0.01).stderr > 1.2 * bound(system, one).stderr)
 
 
+def white(*sizes):
+    return Noise(np.array(sizes), 0.0, np.inf, np.zeros(len(sizes)), Structure())
+
+
 def oscillator(noise, seed=0):
     """Samples of u of u'' = -2 u - 0.3 v + 0.7 f, and its motion for any coefficients and start."""
     t = np.linspace(0, 20, 201)
@@ -170,7 +175,7 @@ def test_the_bound_with_a_measured_input_is_the_one_from_finite_differences():
     u, v = motion(true)
     exact = replace(samples, u=u[:, None], v=v[:, None])
     terms = library("oscillator", "u[n]; v[n]; f[n]")
-    found = bound_along([samples], [exact], terms, 2, true[:3], sizes=[0.01])
+    found = bound_along([samples], [exact], terms, 2, true[:3], noise=white(0.01))
     np.testing.assert_allclose(found.stderr, expected, rtol=1e-3)
     assert found.noise == pytest.approx(0.01 / np.std(u))
 
