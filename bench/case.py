@@ -113,6 +113,12 @@ class Case(Settings):
         """
 
 
+def code_file(name: str) -> str | None:
+    """Return the Python file of a user's that a method or system is named by (FILE.py or FILE.py:NAME), or None."""
+    path = name.rpartition(":")[0] if ".py:" in name else name
+    return path if path.endswith(".py") else None
+
+
 def plain(value: float) -> float | str | None:
     """Return a number as JSON can hold it: None for NaN, a text for infinity."""
     value = float(value)

@@ -12,7 +12,7 @@ Runs are compared case by case in a table of a common form, whatever their kind:
 
 from __future__ import annotations
 
-import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,7 @@ import pandas as pd
 from latticebench.bench.published import read_table
 from latticebench.bench.store import is_store, open_store
 from latticebench.systems.errors import InputError
+from latticebench.systems.files import DATA, read_json, shown
 
 # Round-off differs between machines; errors below this are all the same.
 FLOOR = 1e-9
@@ -121,14 +122,16 @@ def read_run(path: Path) -> pd.DataFrame:
     if is_store(path):
         from latticebench.bench.kinds import each
 
-        parts = [FORMS[name](kind.table(results)) for name, kind, results, _ in each(open_store(path))]
+        store = open_store(path)
+        with store.sound():
+            parts = [FORMS[name](kind.table(results)) for name, kind, results, _ in each(store)]
         return pd.concat(parts, ignore_index=True)
-    if path.is_dir():
+    if os.path.isdir(path):
         # Of a suite of several kinds each kind's tables are in a folder of their own.
         parts = [part for folder in (path, *(path / kind for kind in FORMS)) for part in _published(folder)]
         if parts:
             return pd.concat(parts, ignore_index=True)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise InputError(
             f"{path}: no results; give a store of them, a folder of published tables, or one of {', '.join(TABLES)}"
         )
@@ -145,8 +148,8 @@ def read_run(path: Path) -> pd.DataFrame:
 
 def _published(folder: Path) -> list[pd.DataFrame]:
     """Return what was published of fits, trials and recordings in a folder itself."""
-    parts = [read_run(folder / name) for name in TABLES if (folder / name).is_file()]
-    if (folder / "measured.md").is_file():
+    parts = [read_run(folder / name) for name in TABLES if os.path.isfile(folder / name)]
+    if os.path.isfile(folder / "measured.md"):
         parts.append(_reports(sorted(folder.glob("*.json"))))
     return parts
 
@@ -189,9 +192,11 @@ def _reports(paths: Iterable[Path]) -> pd.DataFrame:
     rows = []
     for path in paths:
         try:
-            found = summarised(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError, KeyError, TypeError):
-            raise InputError(f"{path}: not the report on a recording") from None
+            found = summarised(read_json(path, DATA))
+        except InputError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError):
+            raise InputError(f"{shown(path)}: not the report on a recording") from None
         rows.append({"name": path.stem, "status": "ok", **found})
     return of_recordings(pd.DataFrame(rows))
 

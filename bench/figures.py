@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.escape import label
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.provenance import lines
 from latticebench.bench.tables import cases, summary
@@ -32,6 +33,8 @@ LOWEST = 1e-12
 HIGHEST = 10.0
 # A library as large as the paper's largest fits beside an axis.
 MOST_NAMES = 14
+# Characters of a title in the name of a file, which may have 255.
+MOST_OF_A_NAME = 200
 
 
 def draw_all(
@@ -43,11 +46,12 @@ def draw_all(
         InputError: a file cannot be written.
     """
     written = []
+    results = [_labelled(one) for one in results]
     if "coefficients" in only:
         for name, group in panels(results).items():
             written.append(_save(panel(group), folder / f"coefficients-{name}.png", about))
     table = cases(results)
-    if table["e2"].notna().any():
+    if ((table["status"] == "ok") & table["e2"].notna()).any():
         drawn: dict[str, Callable[[pd.DataFrame], Figure]] = {
             "errors": errors, "error-against-seconds": error_against_seconds
         }  # fmt: skip
@@ -57,6 +61,12 @@ def draw_all(
             if name in only:
                 written.append(_save(draw(table), folder / f"{name}.png", about))
     return written
+
+
+def _labelled(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a result whose names are as they must be written for matplotlib to show them as they are."""
+    names = ("part", "system", "library", "label", "initial")
+    return {**result, "case": {**result["case"], **{n: label(result["case"][n]) for n in names if result["case"][n]}}}
 
 
 def panels(results: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
@@ -74,7 +84,7 @@ def panels(results: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, 
 
 def slug(text: str) -> str:
     """Turn a title into a file name."""
-    return re.sub(r"[^a-z0-9.=]+", "-", text.lower()).strip("-")
+    return re.sub(r"[^a-z0-9.=]+", "-", text.lower()).strip("-")[:MOST_OF_A_NAME]
 
 
 def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
@@ -98,12 +108,12 @@ def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
         gridspec_kw={"width_ratios": widths},
     )  # fmt: skip
     for axes, result in zip(all_axes[0], learnt, strict=False):
-        history, label = result["history"], result["case"]["label"]
+        history, name = result["history"], result["case"]["label"]
         curves = np.array(history["coefficients"])
         for k, term in enumerate(terms):
             axes.plot(history["step"], curves[:, k], color=colours[term], lw=0.9 if colours[term] == "black" else 1.6)
         axes.set_xlabel("iteration")
-        axes.set_title(_with_error(label, result), fontsize=8)
+        axes.set_title(_with_error(name, result), fontsize=8)
     last = all_axes[0][-1]
     for place, result in enumerate(group):
         for k, (term, value) in enumerate(result["coefficients"].items()):
@@ -134,8 +144,8 @@ def _colours(terms: Sequence[str], truth: Mapping[str, float] | None) -> dict[st
     return {term: "black" if truth is not None and truth[term] == 0 else next(colours, "tab:gray") for term in terms}
 
 
-def _with_error(label: str, result: Mapping[str, Any]) -> str:
-    return label if result["e2"] is None else f"{label}  E2 {float(result['e2']):.0e}"
+def _with_error(name: str, result: Mapping[str, Any]) -> str:
+    return name if result["e2"] is None else f"{name}  E2 {float(result['e2']):.0e}"
 
 
 def errors(table: pd.DataFrame) -> Figure:
@@ -257,8 +267,8 @@ def error_against_noise(table: pd.DataFrame) -> Figure:
         here = known[(known["system"] == system) & (known["library"] == library)]
         # A little beside each other, since the best methods lie on one line.
         apart = 0.0 if alone else 0.014
-        for label, line in _noise_curves(axes, here, methods, apart).items():
-            handles.setdefault(label, line)
+        for name, line in _noise_curves(axes, here, methods, apart).items():
+            handles.setdefault(name, line)
         if alone:
             axes.set_xscale("symlog", linthresh=noisy["noise"].min())
         else:

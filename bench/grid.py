@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -49,6 +50,12 @@ class Grid(Settings):
     methods: list[str] | None = None
     time_limit: float = 120.0
     memory_limit: int = 4096
+
+    def count(self, contestants: Mapping[str, Contestant]) -> int:
+        """Return the number of combinations; the arguments are those of `cases`."""
+        axes = [*self.parameters.values(), *(getattr(self, axis) for axis in AXES), self.seeds]
+        labels = list(contestants) if self.methods is None else self.methods
+        return math.prod([len(axis) for axis in axes]) * len(labels) * (len(self.libraries) + len(self.terms))
 
     def cases(self, contestants: Mapping[str, Contestant], where: str) -> Iterator[FitCase]:
         """Return every combination.

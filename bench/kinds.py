@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from latticebench.bench.provenance import describe, lines
 from latticebench.bench.store import WHOLE, Shard, Store
-from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.errors import InputError, printable, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -85,8 +85,11 @@ def each(
     if not names:
         folder = store.path.parent
         raise InputError(f"{folder}: there are no results in it yet; run a suite with --results {folder}")
-    about = describe(store.origins(), store.about(), store.seeds())
+    with store.sound():
+        about = describe(store.origins(), store.about(), store.seeds())
     for name in names:
+        if name not in KINDS:
+            raise InputError(f"{store.path}: it has cases of kind {name!r}, which this latticebench does not know")
         yield name, KINDS[name](), store.results(shard, name, history=history), about
 
 
@@ -96,16 +99,18 @@ def show(store: Store, title: str = "", value: str = "e2", shard: Shard = WHOLE)
 
     found = list(each(store, shard))
     if title:
-        console().print(title, style="bold", highlight=False)
-    for _, kind, results, _ in found:
-        kind.show(results, value)
-    for line in lines(found[0][3]):
-        show_note(line)
+        console().print(printable(title), style="bold", highlight=False, markup=False)
+    with store.sound():
+        for _, kind, results, _ in found:
+            kind.show(results, value)
+        for line in lines(found[0][3]):
+            show_note(line)
 
 
 def rows(store: Store, shard: Shard = WHOLE) -> list[dict[str, Any]]:
     """Return one row per case, the kinds one after the other."""
-    found = (kind.table(results) for _, kind, results, _ in each(store, shard))
+    with store.sound():
+        found = [kind.table(results) for _, kind, results, _ in each(store, shard)]
     return [{str(name): value for name, value in row.items()} for frame in found for row in frame.to_dict("records")]
 
 
@@ -116,11 +121,12 @@ def publish(store: Store, folder: Path, only: Sequence[str] | None = None) -> li
         InputError: the store has no results yet, or a file cannot be written.
     """
     several = len(store.kinds()) > 1
-    return [
-        path
-        for name, kind, results, about in each(store)
-        for path in kind.publish(results, about, folder / name if several else folder, _chosen(only, kind.tables))
-    ]
+    with store.sound():
+        return [
+            path
+            for name, kind, results, about in each(store)
+            for path in kind.publish(results, about, folder / name if several else folder, _chosen(only, kind.tables))
+        ]
 
 
 def draw(store: Store, folder: Path, only: Sequence[str] | None = None) -> list[Path]:
@@ -130,11 +136,12 @@ def draw(store: Store, folder: Path, only: Sequence[str] | None = None) -> list[
         InputError: the store has no results yet, or a file cannot be written.
     """
     several = len(store.kinds()) > 1
-    return [
-        path
-        for name, kind, results, about in each(store, history=True)
-        for path in kind.draw(results, about, folder / name if several else folder, _chosen(only, kind.figures))
-    ]
+    with store.sound():
+        return [
+            path
+            for name, kind, results, about in each(store, history=True)
+            for path in kind.draw(results, about, folder / name if several else folder, _chosen(only, kind.figures))
+        ]
 
 
 def check_tables(only: Sequence[str] | None) -> None:

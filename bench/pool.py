@@ -1,27 +1,31 @@
-"""The pool of worker processes.
+"""The pool of worker processes: which case runs when, and where.
 
-Each slot of the pool is a loky executor with one worker, so that a worker that hangs, eats memory or dies takes no
-other case with it. A worker runs one thread, lives for many cases, and ends when the runner does, however that ends.
+Each slot of the pool has one worker, so that a worker that hangs, eats memory or dies takes no other case with it. A
+worker runs one thread, lives for many cases, and ends when the runner does, however that ends. One that has imported a
+file of the user's is used for no other code.
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Any
+from queue import Empty, SimpleQueue
+from typing import Any, Literal
 
-from latticebench.bench.case import Case, Folders
-from latticebench.bench.threads import ONE_THREAD
-from latticebench.bench.worker import attempt, follow_runner, outcome, ready, too_much
+from latticebench.bench.case import Case, Folders, code_file
+from latticebench.bench.guardian import Guardian
+from latticebench.bench.process import Events, Process
 
+# Seconds between two looks at the limits of what is running.
 POLL = 0.1
-START_LIMIT = 120.0
+# Seconds until a case that another run is on is asked about again.
+AGAIN = 0.5
 # A worker that died may have been the victim of something else; its case gets a second chance.
 TRIES = 2
+
+# What a case that is about to begin is told: it may, it is done already, or it must wait for another run.
+Turn = Literal["run", "done", "later"]
 
 
 def execute(
@@ -29,117 +33,105 @@ def execute(
     folders: Folders,
     *,
     jobs: int,
-    begin: Callable[[Case], bool],
+    begin: Callable[[Case], Turn],
     keep: Callable[[Case, dict[str, Any]], None],
+    pulse: Callable[[], None] = lambda: None,
 ) -> None:
     """Run cases on `jobs` workers.
 
-    A case beyond its time or memory limit has its worker killed; its result says so. On any exception (Ctrl-C among
-    them) all workers are killed before it is passed on.
+    A case beyond its time or memory limit has its worker ended; its result says so. On any exception (Ctrl-C among
+    them) all workers are ended before it is passed on.
 
     Args:
-        cases: in the order in which they begin.
+        cases: in the order in which they begin, but for those with code of the user's, which come last.
         folders: where relative paths start from.
         jobs: worker processes.
-        begin: is asked as a case is about to begin; it is left out where the answer is False.
+        begin: is asked as a case is about to begin.
         keep: takes each result as soon as it is there.
+        pulse: is called about every POLL seconds.
     """
-    queue = deque((case, 1) for case in cases)
-    slots = [_Slot() for _ in range(max(1, min(jobs, len(queue))))]
-    try:
-        while queue or any(slot.busy for slot in slots):
-            for slot in slots:
-                while not slot.busy and queue:
-                    case, number = queue.popleft()
-                    if begin(case):
-                        slot.start(case, folders, number)
-            running = [slot.future for slot in slots if slot.future is not None]
-            wait(running, timeout=POLL, return_when=FIRST_COMPLETED)
-            for slot in slots:
-                result = slot.result() if slot.busy else None
-                if result is None or slot.case is None:
-                    continue
-                if result["status"] == "died" and slot.number < TRIES:
-                    queue.appendleft((slot.case, slot.number + 1))
-                else:
-                    keep(slot.case, result)
-    finally:
-        for slot in slots:
-            slot.close()
+    # A worker is then started anew for each such code once, not at every second case.
+    queue = deque((case, 1) for case in sorted(cases, key=foreign))
+    with Guardian() as guardian:
+        pool = _Pool(max(1, min(jobs, len(queue))), folders, guardian)
+        try:
+            while queue or pool.later or pool.busy:
+                pool.begin(queue, begin)
+                for case, number, result in pool.results():
+                    if result["status"] == "died" and number < TRIES:
+                        queue.appendleft((case, number + 1))
+                    else:
+                        keep(case, result)
+                pulse()
+        finally:
+            pool.close()
 
 
-class _Slot:
-    """One worker process, and the case it is on."""
+def foreign(case: Case) -> str:
+    """Return which files of the user's with code a case runs; empty where all of its code is of this package."""
+    roots = case.roots
+    return "\n".join(path for name in (roots.method, roots.system) if (path := code_file(name)) is not None)
 
-    def __init__(self) -> None:
-        self.executor: Any = None
-        self.worker: int = 0
-        self.future: Future[Any] | None = None
-        self.case: Case | None = None
-        self.number = 0
-        self.since = 0.0
+
+class _Pool:
+    """The workers, and the cases that they are on with the number of the try."""
+
+    def __init__(self, size: int, folders: Folders, guardian: Guardian) -> None:
+        self.events: Events = SimpleQueue()
+        self.folders, self.guardian = folders, guardian
+        self.workers: list[Process | None] = [None] * size
+        self.tries: dict[Process, int] = {}
+        self.later: deque[tuple[float, tuple[Case, int]]] = deque()
+        self.looked = 0.0
 
     @property
     def busy(self) -> bool:
-        return self.future is not None
+        return bool(self.tries)
 
-    def start(self, case: Case, folders: Folders, number: int) -> None:
-        """Hand a case to the worker, with a new worker where there is none."""
-        from joblib.externals.loky.process_executor import ProcessPoolExecutor
+    def begin(self, queue: deque[tuple[Case, int]], ask: Callable[[Case], Turn]) -> None:
+        """Give each worker that waits a case."""
+        while self.later and self.later[0][0] <= time.monotonic():
+            queue.append(self.later.popleft()[1])
+        for place, worker in enumerate(self.workers):
+            if worker in self.tries:
+                continue
+            while queue:
+                case, number = queue.popleft()
+                turn = ask(case)
+                if turn == "later":
+                    self.later.append((time.monotonic() + AGAIN, (case, number)))
+                elif turn == "run":
+                    self._start(place, case, number)
+                    break
 
-        if self.executor is None:
-            self.executor = ProcessPoolExecutor(
-                max_workers=1, env=ONE_THREAD, initializer=follow_runner, initargs=(os.getpid(),)
-            )
-        self.case, self.number, self.since = case, number, time.monotonic()
+    def _start(self, place: int, case: Case, number: int) -> None:
+        code, worker = foreign(case), self.workers[place]
+        if worker is not None and (worker.closed or worker.code != code):
+            worker.close()
+            worker = None
+        if worker is None:
+            worker = self.workers[place] = Process(code, self.events, self.guardian)
+        worker.start(case, self.folders)
+        self.tries[worker] = number
+
+    def results(self) -> list[tuple[Case, int, dict[str, Any]]]:
+        """Wait a moment, and return what has ended: the case, the number of the try, and the result."""
+        found = []
         try:
-            if not self.worker:
-                self.worker = self.executor.submit(ready, type(case)).result(timeout=START_LIMIT)
-                self.since = time.monotonic()
-            self.future = self.executor.submit(attempt, case, folders)
-        except (RuntimeError, OSError, TimeoutError) as error:
-            # A worker that cannot start is a worker that died.
-            self.future = Future()
-            self.future.set_exception(error)
-
-    def result(self) -> dict[str, Any] | None:
-        """Return the result when there is one, be it that a limit was passed; None while the case runs."""
-        assert self.future is not None
-        assert self.case is not None
-        case = self.case
-        if self.future.done():
-            future, self.future = self.future, None
-            error = future.exception()
-            if error is None:
-                return dict(future.result())
-            self.close()
-            return outcome(case, "died", f"the worker process ended by itself {TRIES} times ({type(error).__name__})")
-        if time.monotonic() - self.since > case.time_limit:
-            self.close()
-            return outcome(case, "timeout", f"no result within the time limit of {case.time_limit:g} s")
-        if self._resident_mib() > case.memory_limit:
-            self.close()
-            return outcome(case, "memory", too_much(case))
-        return None
-
-    def _resident_mib(self) -> float:
-        import psutil
-
-        try:
-            return float(psutil.Process(self.worker).memory_info().rss) / 2**20
-        except psutil.Error:
-            return 0.0
+            worker, line = self.events.get(timeout=POLL)
+            found.append((worker, worker.case, worker.take(line)))
+        except Empty:
+            pass
+        if time.monotonic() - self.looked > POLL:
+            self.looked = time.monotonic()
+            found += [(worker, worker.case, worker.overdue()) for worker in list(self.tries)]
+        return [
+            (case, self.tries.pop(worker), result)
+            for worker, case, result in found
+            if case is not None and result is not None
+        ]
 
     def close(self) -> None:
-        """End the worker, whatever it is doing."""
-        import psutil
-
-        self.future = None
-        if self.executor is not None:
-            executor, self.executor = self.executor, None
-            worker, self.worker = self.worker, 0
-            # First the process itself: the executor's own way waits for a lock that a stuck worker may hold.
-            if worker:
-                with contextlib.suppress(psutil.Error):
-                    psutil.Process(worker).kill()
-            executor.shutdown(wait=True, kill_workers=True)
+        for worker in self.workers:
+            if worker is not None:
+                worker.close()

@@ -15,6 +15,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from latticebench.systems.errors import printable
+
 DISTRIBUTION = "latticebench"
 # Seeds in a row that are named one by one.
 MOST_LISTED = 10
@@ -126,10 +128,10 @@ def lines(about: Mapping[str, Any]) -> list[str]:
             value = "; ".join(f"{key} {entry}" for key, entry in value.items())
         elif isinstance(value, (list, tuple)):
             value = ", ".join(str(entry) for entry in (_ranges(value) if name == "seeds" else value))
-        written.append(f"{name}: {value}")
+        written.append(printable(f"{name}: {value}"))
     return written
 
 
 def command_line() -> str:
     """Return the command of this process as it would be typed."""
-    return shlex.join(["latticebench", *sys.argv[1:]])
+    return printable(shlex.join(["latticebench", *sys.argv[1:]]))

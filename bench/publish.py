@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.escape import csv_table, markdown
 from latticebench.bench.provenance import lines
 from latticebench.bench.tables import ABOUT, summary, tables
+from latticebench.systems.errors import printable
 from latticebench.systems.files import write_text
 from latticebench.systems.terms import Term
 
@@ -103,17 +105,21 @@ def render(frame: pd.DataFrame, about: Mapping[str, Any], form: str) -> str:
     """
     head = lines(about)
     if form == "csv":
-        return "".join(f"# {line}\n" for line in head) + frame.to_csv(index=False)
+        return "".join(f"# {line}\n" for line in head) + csv_table(frame)
     readable = _without_empty(frame.drop(columns=[name for name in ("identity", "settings") if name in frame]))
     for name in readable.columns:
         if pd.api.types.is_float_dtype(readable[name]):
             readable[name] = [format_number(value) for value in readable[name]]
     if form == "md":
-        quoted = readable.map(lambda value: str(value).replace("|", "\\|"))
+        quoted = readable.map(lambda value: markdown(str(value)))
         if "term" in quoted:
-            quoted["term"] = [f"`{term}`" for term in quoted["term"]]
-        return quoted.to_markdown(index=False, disable_numparse=True) + "\n\n" + "".join(f"- {line}\n" for line in head)
-    return "".join(f"% {line}\n" for line in (NEEDS, *head)) + _latex(readable.map(str))
+            # What stands between backticks is shown as it is, but for the end of a cell.
+            quoted["term"] = ["`" + str(term).replace("|", "\\|") + "`" for term in readable["term"]]
+        quoted.columns = pd.Index([markdown(str(name)) for name in quoted.columns])
+        about_it = "".join(f"- {markdown(line)}\n" for line in head)
+        return quoted.to_markdown(index=False, disable_numparse=True) + "\n\n" + about_it
+    readable.columns = pd.Index([printable(str(name)) for name in readable.columns])
+    return "".join(f"% {line}\n" for line in (NEEDS, *head)) + _latex(readable.map(lambda value: printable(str(value))))
 
 
 def _latex(texts: pd.DataFrame) -> str:

@@ -8,19 +8,23 @@ from pathlib import Path
 
 import pandas as pd
 
+from latticebench.bench.escape import csv_text
 from latticebench.systems.errors import InputError
+from latticebench.systems.files import DATA, read_text, shown
 
 
 def read_table(path: Path) -> pd.DataFrame:
     """Read a published table, every cell as text.
 
     Raises:
-        InputError: it is no CSV file.
+        InputError: it is no CSV file, or cannot be read.
     """
     try:
-        text = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        text = read_text(path, DATA).splitlines(keepends=True)
         # The head is provenance; a sharp sign further down is part of a cell.
         body = itertools.dropwhile(lambda line: line.startswith("#"), text)
-        return pd.read_csv(io.StringIO("".join(body)), dtype=str, keep_default_na=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not a table: {error}") from None
+        return pd.read_csv(io.StringIO("".join(body)), dtype=str, keep_default_na=False).map(csv_text)
+    except InputError:
+        raise
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{shown(path)}: not a table: {str(error).strip()}") from None

@@ -7,12 +7,13 @@ SHA-256 says that it is the one that the published results are of.
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.files import whole
+from latticebench.systems.files import DATA, reading, whole
 
 # Where copies go unless told otherwise.
 FOLDER = Path("data")
@@ -109,12 +110,9 @@ def fingerprint(path: Path) -> str:
         InputError: it cannot be read.
     """
     found = hashlib.sha256()
-    try:
-        with path.open("rb") as file:
-            while chunk := file.read(CHUNK):
-                found.update(chunk)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    with reading(path, DATA) as file:
+        while chunk := file.read(CHUNK):
+            found.update(chunk)
     return found.hexdigest()
 
 
@@ -135,7 +133,7 @@ def take(name: str, origin: Path, place: Path | None = None) -> tuple[Path, bool
     recording = find(name)
     place = FOLDER if place is None else place
     # A place without an ending that a recording could have is a folder.
-    if place.is_dir() or place.suffix.lower() != ".csv":
+    if os.path.isdir(place) or place.suffix.lower() != ".csv":
         place = place / f"{name}.csv"
     found = fingerprint(origin)
     if found != recording.sha256:
@@ -143,7 +141,7 @@ def take(name: str, origin: Path, place: Path | None = None) -> tuple[Path, bool
             f"{origin}: its SHA-256 is {found}, that of {name!r} is {recording.sha256}; this is another file, or the "
             f"same data in another form than {recording.rows} rows of {recording.columns}"
         )
-    if place.exists():
+    if os.path.lexists(place):
         if fingerprint(place) == found:
             return place, False
         raise InputError(f"{place}: another file is there already; move it away, or give another place")

@@ -10,7 +10,8 @@ from typing import Any, Protocol
 
 from latticebench.bench import source
 from latticebench.bench.case import Case
-from latticebench.bench.pool import execute
+from latticebench.bench.leases import Leases
+from latticebench.bench.pool import Turn, execute
 from latticebench.bench.provenance import origin
 from latticebench.bench.store import WHOLE, Results, Shard, Store
 from latticebench.bench.suite import Suite
@@ -76,16 +77,6 @@ def run(
     if watcher is not None:
         watcher.count(len(waiting))
 
-    def begin(case: Case) -> bool:
-        # Another run on the same store may have finished the case in the meantime, unless failures are to be run again.
-        found = {} if retry else store.finished(keys[case.identity])
-        if any(_counts(case, *one, retry) for one in found.values()):
-            tally.reused += 1
-            return False
-        if watcher is not None:
-            watcher.started(case)
-        return True
-
     def keep(case: Case, result: dict[str, Any]) -> None:
         store.put(keys[case.identity], case, result, made)
         tally.ran += 1
@@ -93,11 +84,42 @@ def run(
             watcher.finished(case, result)
 
     if waiting:
-        execute(waiting, suite.folders, jobs=jobs, begin=begin, keep=keep)
+        leases = Leases(store)
+        turns = _Turns(store, leases, keys, before, retry, tally, watcher)
+        try:
+            execute(waiting, suite.folders, jobs=jobs, begin=turns.turn, keep=keep, pulse=leases.renew)
+        finally:
+            leases.give_back()
     store.forget_replaced()
     store.relabel(_renamed(wanted, store.finished() if waiting else before))
     tally.statuses = store.statuses(shard)
     return store.results(shard), tally
+
+
+@dataclass(frozen=True)
+class _Turns:
+    """What decides whether a case is run now: its lease, and whether another run has finished it in the meantime."""
+
+    store: Store
+    leases: Leases
+    keys: Mapping[str, str]
+    before: Mapping[str, tuple[str, str]]
+    retry: bool
+    tally: Tally
+    watcher: Watcher | None
+
+    def turn(self, case: Case) -> Turn:
+        key = self.keys[case.identity]
+        if not self.leases.take(key):
+            return "later"
+        for found in self.store.finished(key).values():
+            if _counts(case, *found, self.retry) or self.before.get(key) != found:
+                self.leases.give_back(key)
+                self.tally.reused += 1
+                return "done"
+        if self.watcher is not None:
+            self.watcher.started(case)
+        return "run"
 
 
 def _renamed(cases: Mapping[str, Case], finished: Mapping[str, tuple[str, str]]) -> dict[str, Case]:

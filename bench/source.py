@@ -12,12 +12,15 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
+import os
 import pkgutil
+import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from latticebench import methods, systems
-from latticebench.bench.case import Case, Folders, Roots
+from latticebench.bench.case import Case, Folders, Roots, code_file
 from latticebench.systems.errors import unknown
 
 PACKAGE = "latticebench"
@@ -58,14 +61,12 @@ def files(roots: Roots, folders: Folders) -> set[Path]:
     """
     waiting = {_module_file(roots.module)}
     if roots.method:
-        path = (
-            folders.suite / roots.method.rpartition(":")[0] if ".py:" in roots.method else folders.suite / roots.method
-        )
-        waiting.add(path if path.suffix == ".py" else _home_of_method(roots.method))
+        own = code_file(roots.method)
+        waiting.add(_home_of_method(roots.method) if own is None else folders.suite / own)
     if roots.system:
         path = folders.suite / roots.system
         waiting.add(path if path.suffix in (".py", ".toml") else _home_of_system(roots.system))
-    if roots.recording and (folders.data / roots.recording).is_file():
+    if roots.recording and os.path.isfile(folders.data / roots.recording):
         waiting.add(folders.data / roots.recording)
     found: set[Path] = set()
     while waiting:
@@ -103,10 +104,15 @@ def _imports(path: Path, changed: int) -> frozenset[Path]:  # noqa: ARG001
     """Return the files of this package that a file imports, anywhere in it; `changed` renews the memory."""
     if path.suffix != ".py":
         return frozenset()
-    text = path.read_text(encoding="utf-8")
+    text = path.read_bytes()
+    tree = _tree(text)
     # A package that looks its modules up uses all of them.
-    found = set(path.parent.glob("*.py")) if path.name == "__init__.py" and "iter_modules" in text else set()
-    for name in _names(ast.parse(text)):
+    found = set(path.parent.glob("*.py")) if path.name == "__init__.py" and b"iter_modules" in text else set()
+    try:
+        names = [] if tree is None else list(_names(tree))
+    except RecursionError:
+        names = []
+    for name in names:
         parts = name.split(".")
         # The __init__ of a room looks its modules up by name and computes nothing.
         for length in range(3, len(parts) + 1 if parts[0] == PACKAGE else 0):
@@ -116,6 +122,16 @@ def _imports(path: Path, changed: int) -> frozenset[Path]:  # noqa: ARG001
                 # The name of something in a module.
                 break
     return frozenset(found)
+
+
+def _tree(content: bytes) -> ast.Module | None:
+    """Return the syntax tree of a file; None for one of a user's that is no Python, which its cases will say."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SyntaxWarning)
+            return ast.parse(content)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return None
 
 
 def _names(node: ast.AST) -> Iterator[str]:
@@ -133,8 +149,8 @@ def _names(node: ast.AST) -> Iterator[str]:
 def _digest(path: Path, changed: int) -> str:  # noqa: ARG001
     content = path.read_bytes()
     if path.suffix == ".py":
-        tree = ast.parse(content)
-        for node in ast.walk(tree):
+        tree = _tree(content)
+        for node in ast.walk(tree) if tree is not None else ():
             if (
                 isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
                 and node.body
@@ -143,5 +159,7 @@ def _digest(path: Path, changed: int) -> str:  # noqa: ARG001
                 and isinstance(node.body[0].value.value, str)
             ):
                 node.body = node.body[1:]
-        content = ast.dump(tree).encode()
+        # What is nested too deeply counts as it is.
+        with suppress(RecursionError):
+            content = content if tree is None else ast.dump(tree).encode()
     return hashlib.sha256(content).hexdigest()

@@ -4,6 +4,7 @@
     origins  what made results: commit, date, machine and versions, each once
     suite    the keys of the suite that was run last, in their order
     about    what else was written down of that run: command, settings
+    leases   which run is on which case, see `bench.leases`
 
 Each result is committed at once, in a transaction of its own, so that a killed run loses nothing that it had
 reported, and two runs at once harm nothing. The history of a fit, which is most of a result, is read only where it is
@@ -13,6 +14,7 @@ asked for.
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 import weakref
 from collections.abc import Iterator, Mapping
@@ -23,6 +25,7 @@ from typing import Any
 
 from latticebench.bench.case import STATUSES, Case
 from latticebench.systems.errors import InputError
+from latticebench.systems.files import shown
 
 VERSION = 4
 FILE = "results.sqlite"
@@ -42,7 +45,10 @@ CREATE INDEX IF NOT EXISTS by_identity ON results (identity, key);
 CREATE INDEX IF NOT EXISTS by_key ON results (key, kind, status, seed, origin);
 CREATE TABLE IF NOT EXISTS suite (place INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE);
 CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS leases (key TEXT PRIMARY KEY, owner TEXT NOT NULL, until REAL NOT NULL);
 """
+# What reading or writing a file of SQLite raises; a text in it that is not UTF-8 is no error of its own.
+FAILURES = (sqlite3.Error, UnicodeError)
 CHOOSE = "choose another place with --results"
 
 
@@ -93,12 +99,13 @@ class Store:
         history = content.pop("history", None)
         seed = getattr(case, "seed", None)
         texts = [None if value is None else json.dumps(value, allow_nan=False) for value in (made, content, history)]
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             cursor.execute("INSERT OR IGNORE INTO origins (origin) VALUES (?)", texts[:1])
             cursor.execute(
                 "INSERT OR REPLACE INTO results SELECT ?, ?, ?, ?, ?, ?, ?, number, ?, ? FROM origins WHERE origin = ?",
                 (key, case.identity, case.kind, case.model_dump_json(), status, reason, seed, *texts[1:], texts[0]),
             )
+            cursor.execute("DELETE FROM leases WHERE key = ?", (key,))
 
     def plan(self, keys: Mapping[str, str], about: Mapping[str, Any]) -> None:
         """Record which suite is run.
@@ -108,7 +115,7 @@ class Store:
             about: the command and what else is worth knowing.
         """
         rows = [(place, key, identity) for place, (identity, key) in enumerate(keys.items())]
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             # In this connection it hides the table of the file: a run goes by its own plan, whatever another run on
             # the same store plans meanwhile.
             cursor.execute(
@@ -128,7 +135,7 @@ class Store:
 
         So a run that is stopped, or is of a shard alone, takes nothing away that it has not made anew.
         """
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             cursor.execute(
                 "DELETE FROM results WHERE key IN (SELECT old.key FROM temp.suite AS planned "
                 "JOIN results AS fresh ON fresh.key = planned.key "
@@ -137,7 +144,7 @@ class Store:
 
     def relabel(self, cases: Mapping[str, Case]) -> None:
         """Record the labels and limits that cases have in this suite; the keys are those of their results."""
-        with self._writing() as cursor:
+        with self.writing() as cursor:
             rows = [(case.model_dump_json(), key) for key, case in cases.items()]
             cursor.executemany('UPDATE results SET "case" = ? WHERE key = ?', rows)
 
@@ -175,12 +182,28 @@ class Store:
 
     def about(self) -> dict[str, Any]:
         """Return what was written down of the suite that was run last; empty where none was."""
-        return {name: json.loads(value) for name, value in self.read("SELECT name, value FROM about ORDER BY name")}
+        with self.sound():
+            return {name: json.loads(value) for name, value in self.read("SELECT name, value FROM about ORDER BY name")}
 
     def origins(self) -> list[dict[str, Any]]:
         """Return the commits, dates, machines and versions that made the results of the suite that was run last."""
         used = "SELECT DISTINCT origin FROM suite JOIN results USING (key)"
-        return [json.loads(text) for (text,) in self.read(f"SELECT origin FROM origins WHERE number IN ({used})")]
+        with self.sound():
+            return [json.loads(text) for (text,) in self.read(f"SELECT origin FROM origins WHERE number IN ({used})")]
+
+    @contextmanager
+    def sound(self) -> Iterator[None]:
+        """Turn what goes wrong with content of another form than that of results into one line of text.
+
+        Raises:
+            InputError: the content is damaged.
+        """
+        try:
+            yield
+        except InputError:
+            raise
+        except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+            raise _damaged(self.path, f"a result has another form ({type(error).__name__}: {error})") from error
 
     def seeds(self) -> list[int]:
         """Return the seeds of the finished cases of the suite that was run last."""
@@ -188,12 +211,23 @@ class Store:
         return [number for (number,) in rows if number is not None]
 
     @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Cursor]:
-        """Write all that the block does, or nothing."""
+    def writing(self, *, durable: bool = True) -> Iterator[sqlite3.Cursor]:
+        """Write all that the block does, or nothing.
+
+        Args:
+            durable: wait until it is on the disk; what is not may be lost when the machine, not when the run, fails.
+
+        Raises:
+            InputError: it cannot be written, or is damaged.
+        """
         try:
+            if not durable:
+                self.connection.execute("PRAGMA synchronous = NORMAL")
             with self.connection:
                 yield self.connection.execute("BEGIN IMMEDIATE")
-        except sqlite3.Error as error:
+            if not durable:
+                self.connection.execute("PRAGMA synchronous = FULL")
+        except FAILURES as error:
             raise _unwritable(self.path, error) from None
 
     def read(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -204,7 +238,7 @@ class Store:
         """
         try:
             yield from self.connection.execute(query, values)
-        except sqlite3.Error as error:
+        except FAILURES as error:
             raise _damaged(self.path, str(error)) from None
 
 
@@ -230,14 +264,16 @@ class Results:
         Raises:
             InputError: the store is damaged.
         """
-        origins = {number: json.loads(text) for number, text in self.store.read("SELECT number, origin FROM origins")}
+        with self.store.sound():
+            rows = self.store.read("SELECT number, origin FROM origins")
+            origins = {number: json.loads(text) for number, text in rows}
         history = "history" if self.history else "NULL"
         columns = f'key, results.identity, "case", status, reason, origin, content, {history}'
         for key, identity, case, status, reason, origin, content, past in self._rows(columns):
             try:
                 found = {"case": json.loads(case), "identity": identity, "status": status, "reason": reason}
                 found.update(json.loads(content), made=origins[origin], history=past and json.loads(past))
-            except (ValueError, TypeError, KeyError):
+            except (ValueError, TypeError, KeyError, RecursionError):
                 raise _damaged(self.store.path, f"the result {key} is not one") from None
             yield found
 
@@ -254,26 +290,32 @@ def create(folder: Path) -> Store:
     Raises:
         InputError: the folder holds something else, is of another version, or cannot be written.
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: a file, not a folder; {CHOOSE}")
+    if os.path.exists(folder) and not os.path.isdir(folder):
+        raise InputError(f"{shown(folder)}: a file, not a folder; {CHOOSE}")
     path = folder / FILE
     try:
         _refuse_json(folder)
         if folder.is_dir() and any(one.name not in OWN_FILES for one in folder.iterdir()) and not path.exists():
             raise InputError(f"{folder}: not a store of results and not empty; {CHOOSE}")
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: {error.strerror or error}; {CHOOSE}") from None
+        # A folder that a link in place of the file leads to is none that was chosen.
+        if os.path.lexists(path) and not _is_file(path):
+            raise InputError(f"{shown(path)}: not a store of results, nor a file; {CHOOSE}")
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = error.strerror if isinstance(error, OSError) else None
+        raise InputError(f"{shown(folder)}: {reason or error}; {CHOOSE}") from None
     try:
         connection = _connect(path, "rwc", fresh=True)
         try:
             _keep_journal(connection)
             marks = f"PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {VERSION};"
             connection.executescript(f"BEGIN IMMEDIATE; {TABLES} {marks} COMMIT;")
-        except sqlite3.Error:
+        except FAILURES:
             connection.close()
             raise
-    except sqlite3.Error as error:
+    except FAILURES as error:
         raise _unwritable(path, error) from None
     return Store(path, connection)
 
@@ -286,26 +328,31 @@ def open_store(folder: Path) -> Store:
     """
     _refuse_json(folder)
     path = folder / FILE
-    if not path.is_file():
+    if not _is_file(path):
         raise InputError(
-            f"{folder}: not a store of results (no {FILE} in it); "
+            f"{shown(folder)}: not a store of results (no {FILE} in it); "
             f"make one with: latticebench run SUITE --results {folder}"
         )
     try:
         return Store(path, _connect(path, "rw"))
-    except sqlite3.Error as error:
+    except FAILURES as error:
         # A place that cannot be written has no room for the index of a journal; nor does anybody write there.
         if not isinstance(error, sqlite3.OperationalError) or (folder / OWN_FILES[1]).exists():
             raise _damaged(path, str(error)) from None
     try:
         return Store(path, _connect(path, "ro&immutable=1"))
-    except sqlite3.Error as error:
+    except FAILURES as error:
         raise _damaged(path, str(error)) from None
 
 
 def is_store(folder: Path) -> bool:
     """Return whether a folder holds a store, be it one that cannot be read."""
-    return (folder / FILE).is_file() or (folder / "store.json").is_file()
+    return _is_file(folder / FILE) or _is_file(folder / "store.json")
+
+
+def _is_file(path: Path) -> bool:
+    """Return whether there is a regular file, of whatever name."""
+    return os.path.isfile(path)
 
 
 def _connect(path: Path, mode: str, *, fresh: bool = False) -> sqlite3.Connection:
@@ -313,8 +360,10 @@ def _connect(path: Path, mode: str, *, fresh: bool = False) -> sqlite3.Connectio
     uri = f"{path.resolve().as_uri()}?mode={mode}"
     connection = sqlite3.connect(uri, uri=True, timeout=PATIENCE, isolation_level=None)
     try:
+        # The file may be anybody's: what its schema calls must be harmless.
+        connection.execute("PRAGMA trusted_schema = OFF")
         _check(connection, path, fresh)
-    except (sqlite3.Error, InputError):
+    except (*FAILURES, InputError):
         connection.close()
         raise
     return connection
@@ -329,10 +378,11 @@ def _keep_journal(connection: sqlite3.Connection) -> None:
 
 
 def _check(connection: sqlite3.Connection, path: Path, fresh: bool) -> None:
+    # In this order: another run may be making the tables and, after them, the mark.
+    names = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
     application, version = (
         connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
     )
-    names = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
     if fresh and not names and not application:
         return
     if application != APPLICATION:
@@ -345,7 +395,7 @@ def _check(connection: sqlite3.Connection, path: Path, fresh: bool) -> None:
 
 def _refuse_json(folder: Path) -> None:
     """Refuse a store of JSON files, as there were up to version 2."""
-    if (folder / "store.json").is_file():
+    if _is_file(folder / "store.json"):
         raise _other_version(folder, "2 or older")
 
 
@@ -356,7 +406,7 @@ def _other_version(folder: Path, version: object) -> InputError:
     )
 
 
-def _unwritable(path: Path, error: sqlite3.Error) -> InputError:
+def _unwritable(path: Path, error: Exception) -> InputError:
     if not isinstance(error, sqlite3.OperationalError):
         return _damaged(path, str(error))
     return InputError(

@@ -37,6 +37,8 @@ recordings.
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -45,12 +47,14 @@ from typing import Any, TypeVar
 
 import pydantic
 
-from latticebench import methods
-from latticebench.bench.case import DATA, Case, Folders, Settings
+from latticebench import methods, systems
+from latticebench.bench.case import DATA, Case, Folders, Settings, code_file
+from latticebench.bench.effort import check_cases, check_size
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.grid import Contestant, Grid
 from latticebench.methods.method import make
 from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.files import check_regular
 from latticebench.systems.toml import read_toml
 
 HERE = Path(__file__).parent / "suites"
@@ -108,39 +112,49 @@ def file_of(name: str) -> Path:
     return HERE / f"{name}.toml"
 
 
-def load(name: str, data: Path = DATA) -> Suite:
+def load(name: str, data: Path = DATA, *, large: bool = False) -> Suite:
     """Load a suite by its name, or from a TOML file, and check every name in it.
 
     Args:
         name: of the suite, or its file.
         data: the folder of measured recordings.
+        large: take it even if it asks for absurdly much, see `bench.effort`.
 
     Raises:
         InputError: the suite is unknown or unsound; the text names the file and the key.
     """
     path = file_of(name)
     shown = name if name.endswith(".toml") else f"suite {name}"
+    if not re.fullmatch(r"\w[\w .+=-]*", path.stem):
+        raise InputError(f"{shown}: results are kept under the suite's name; begin it with a letter or a digit")
     file = _checked(_File, read_toml(path), shown)
     folders = Folders(path.resolve().parent, data)
     if not (file.grid or file.made or file.laboratory or file.measured):
         raise InputError(f"{shown}: no cases; write at least one [[grid]], [[made]], [[laboratory]] or [[measured]]")
-    cases = [*_fits(file, shown), *_trials(file, shown), *_laboratory(file, shown), *_recordings(file, shown)]
+    cases: dict[str, Case] = {}
+    blocks = (_fits(file, shown, large), _trials(file, shown), _laboratory(file, shown), _recordings(file, shown))
+    for case in itertools.chain(*blocks):
+        cases[case.identity] = case
+        if not large:
+            check_cases(len(cases), shown)
     for label, contestant in file.methods.items():
         try:
-            make(methods.find(contestant.method, folders.suite), contestant.settings)
+            _check_method(contestant, folders.suite)
         except InputError as error:
             raise InputError(f"{shown}: methods.{label}: {error}") from None
     try:
-        _look_up((case for case in cases if isinstance(case, FitCase)), folders.suite)
+        _look_up((case for case in cases.values() if isinstance(case, FitCase)), folders.suite, large)
     except InputError as error:
         raise InputError(f"{shown}: {error}") from None
-    return Suite(path.stem, file.title, {case.identity: case for case in cases}, folders, file.methods)
+    return Suite(path.stem, file.title, cases, folders, file.methods)
 
 
-def _fits(file: _File, shown: str) -> Iterator[Case]:
+def _fits(file: _File, shown: str, large: bool) -> Iterator[Case]:
     for number, block in enumerate(file.grid, start=1):
         where = f"{shown}: grid {number}"
         grid = _checked(Grid, {**file.defaults, **block}, where)
+        if not large:
+            check_cases(grid.count(file.methods), where)
         with _told(where, FitCase):
             yield from grid.cases(file.methods, where)
 
@@ -175,18 +189,38 @@ def _recordings(file: _File, shown: str) -> Iterator[Case]:
             yield _checked(Measured, block, f"{shown}: measured {number}")
 
 
-def _look_up(cases: Iterable[FitCase], base: Path) -> None:
-    """Make sure that the systems, parameters, initial states and libraries of cases exist.
+def _check_method(contestant: Contestant, base: Path) -> None:
+    """Make sure that a method exists, and that it has such settings where its code is of this package.
+
+    A file of the user's is looked at and not imported: its code runs in the workers alone, within the limits of a case.
+    """
+    path = code_file(contestant.method)
+    if path is None:
+        make(methods.find(contestant.method), contestant.settings)
+    else:
+        check_regular(base / path)
+
+
+def _look_up(cases: Iterable[FitCase], base: Path, large: bool) -> None:
+    """Make sure that the systems, parameters, initial states and libraries of cases exist, and that the samples fit.
 
     Raises:
         InputError: one of them does not.
     """
     known = set()
     for case in cases:
-        about = (case.system, case.library, case.terms, case.initial, tuple(case.parameters.items()))
+        size = (case.sites, case.samples, case.trajectories, case.span, case.memory_limit)
+        about = (case.system, case.library, case.terms, case.initial, tuple(case.parameters.items()), size)
         if about in known:
             continue
         known.add(about)
+        path = code_file(case.system)
+        if path is not None:
+            check_regular(base / path)
+        if not large:
+            check_size(case, case.sites or (systems.find(case.system, base).sites if path is None else 1), case.data)
+        if path is not None:
+            continue
         system, _ = case.resolve(base)
         system.with_parameters(case.parameters)
         if case.initial is not None and case.initial not in system.initials:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -167,9 +168,11 @@ def read_cases(path: Path) -> pd.DataFrame:
         InputError: there is neither at `path`.
     """
     if is_store(path):
-        return cases(open_store(path).results(kind="fit"))
-    path = path / "cases.csv" if path.is_dir() else path
-    if not path.is_file():
+        store = open_store(path)
+        with store.sound():
+            return cases(store.results(kind="fit"))
+    path = path / "cases.csv" if os.path.isdir(path) else path
+    if not os.path.isfile(path):
         raise InputError(f"{path}: no such table; give a store of results, a folder with cases.csv, or a cases.csv")
     table = read_table(path)
     missing = [name for name in ("identity", "status", "e2") if name not in table]

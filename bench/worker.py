@@ -4,26 +4,63 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import sys
 import threading
-import time
 from collections.abc import Mapping
-from contextlib import redirect_stdout
-from typing import Any
+from contextlib import suppress
+from typing import Any, BinaryIO
 
 from latticebench.bench.case import Case, Folders
 from latticebench.bench.memory import memory_limit
+from latticebench.bench.tree import adopt_orphans
 from latticebench.methods.method import Skipped
 from latticebench.systems.errors import InputError
 
 MAX_REASON = 300
-# How often a worker looks whether its runner still lives, in seconds.
-WATCH = 0.5
+# Bytes of a result as JSON.
+MOST_BYTES = 64 * 2**20
+# Bytes that tell how long a request is.
+LENGTH = 8
 
 
-def ready(kind: type[Case]) -> int:  # noqa: ARG001
-    """Return the number of the process, which has imported what a kind of case needs: that is none of a case's time."""
-    return os.getpid()
+def serve() -> None:
+    """Take cases from standard input and answer on standard output, a line of JSON each, until there are no more.
+
+    A case gets neither: it reads nothing, and what it prints, by whatever way, goes to standard error.
+    """
+    requests, answers = _own_pipes()
+    adopt_orphans()
+    own = os.getpid()
+    while head := requests.read(LENGTH):
+        number, case, folders = pickle.loads(requests.read(int.from_bytes(head, "big")))
+        _answer(answers, {"begun": number})
+        threads = threading.active_count()
+        result = attempt(case, folders)
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(Exception):
+                stream.flush()
+        # A copy of this process that the case has made ends here.
+        if os.getpid() != own:
+            os._exit(0)
+        _answer(answers, {"done": number, "result": result, "clean": threading.active_count() <= threads})
+    # A thread that a case has left must not hold the end up.
+    os._exit(0)
+
+
+def _own_pipes() -> tuple[BinaryIO, BinaryIO]:
+    """Return standard input and output, moved to where nobody looks for them."""
+    requests, answers = os.dup(0), os.dup(1)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    os.dup2(2, 1)
+    return os.fdopen(requests, "rb"), os.fdopen(answers, "wb")
+
+
+def _answer(pipe: BinaryIO, content: Mapping[str, Any]) -> None:
+    pipe.write(json.dumps(content).encode() + b"\n")
+    pipe.flush()
 
 
 def attempt(case: Case, folders: Folders) -> dict[str, Any]:
@@ -34,20 +71,20 @@ def attempt(case: Case, folders: Folders) -> dict[str, Any]:
     """
     found = case.blank()
     try:
-        # What a method prints is for people, not for a program that reads the result.
-        with memory_limit(case.memory_limit), redirect_stdout(sys.stderr):
+        with memory_limit(case.memory_limit):
             case.run(folders, found)
-        # What a method of the user's returns may be anything; a result is what JSON can hold.
-        json.dumps(found, allow_nan=False)
+        _check(found)
     except Skipped as skipped:
         return outcome(case, "skipped", str(skipped), found)
     except MemoryError:
         return outcome(case, "memory", too_much(case), found)
-    except Exception as error:
-        if "allocate memory" in str(error) or "Unable to allocate" in str(error):
+    # Even SystemExit and KeyboardInterrupt: a method may raise anything, and nobody else does so here.
+    except BaseException as error:
+        text = _text(error)
+        if "allocate memory" in text or "Unable to allocate" in text:
             return outcome(case, "memory", too_much(case), found)
-        text = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        return outcome(case, "failed", text, found if _is_json(found) else None)
+        told = text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"
+        return outcome(case, "failed", told, found if _is_result(found) else None)
     return outcome(case, "ok", "", found)
 
 
@@ -55,17 +92,14 @@ def outcome(case: Case, status: str, reason: str = "", found: Mapping[str, Any] 
     """Return a result: a status of `bench.case.STATUSES`, the reason in one short line, and what was found."""
     return {
         "status": status,
-        "reason": " ".join(reason.split())[:MAX_REASON],
+        "reason": one_line(reason, MAX_REASON),
         **(case.blank() if found is None else found),
     }
 
 
-def _is_json(found: Mapping[str, Any]) -> bool:
-    try:
-        json.dumps(found, allow_nan=False)
-    except (TypeError, ValueError, RecursionError):
-        return False
-    return True
+def one_line(text: str, most: int) -> str:
+    """Return a text in one line, at most so long, with a question mark for every character that cannot be printed."""
+    return "".join(sign if sign.isprintable() else "?" for sign in " ".join(text[: 8 * most].split()))[:most]
 
 
 def too_much(case: Case) -> str:
@@ -73,25 +107,30 @@ def too_much(case: Case) -> str:
     return f"more than {case.memory_limit} MiB of memory were needed"
 
 
-def follow_runner(runner: int) -> None:
-    """Leave Ctrl-C to the runner, and end when the runner is gone.
+def _text(error: BaseException) -> str:
+    """Return what an error says; one of a user's may fail to say anything."""
+    try:
+        return str(error)
+    except Exception:
+        return "it says nothing"
 
-    Args:
-        runner: the number of its process.
+
+def _check(found: Mapping[str, Any]) -> None:
+    """Refuse what is no result: what a user's method returns may be anything.
+
+    Raises:
+        TypeError, ValueError: JSON cannot hold it.
+        RecursionError: it is nested too deeply.
+        InputError: it is too long.
     """
-    import signal
+    size = len(json.dumps(found, allow_nan=False))
+    if size > MOST_BYTES:
+        raise InputError(f"the result is too long: {size / 2**20:.0f} MiB as text, at most {MOST_BYTES // 2**20}")
 
-    import psutil
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch() -> None:
-        try:
-            parent = psutil.Process(runner)
-            while parent.is_running() and parent.status() != psutil.STATUS_ZOMBIE:
-                time.sleep(WATCH)
-        except psutil.Error:
-            pass
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+def _is_result(found: Mapping[str, Any]) -> bool:
+    try:
+        _check(found)
+    except (TypeError, ValueError, RecursionError, MemoryError):
+        return False
+    return True

@@ -13,6 +13,14 @@ class InputError(ValueError):
     """
 
 
+def printable(text: str) -> str:
+    """Return a text in one line in which every sign that does not show is written as an escape.
+
+    So neither a file's name nor a label can steer a terminal or end a line of a file.
+    """
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
+
 def unknown(kind: str, given: str, known: Iterable[str], where: str = "") -> InputError:
     """Return the error for a name that is not among the known ones, with the closest one as a suggestion."""
     names = sorted(known)

@@ -8,22 +8,29 @@ CSV and Parquet have the columns `t,u1..uN[,v1..vN][,f1..fN | f]` (real field) o
 from __future__ import annotations
 
 import csv
+import io
 import re
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from latticebench.systems.errors import InputError
+from latticebench.systems.files import DATA, LARGEST, check_regular, largest, read_text, reading, shown
 from latticebench.systems.samples import Samples, check_alike
 from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
     import pandas
+    import pyarrow
     from numpy import ndarray
 
 FORMATS = (".csv", ".npz", ".parquet")
+ARRAYS = ("t", "u", "v", "f", "trajectory")
+# Characters of a cell; the longest number has some 25.
+MOST_IN_A_CELL = 10_000
 
 
 def read(path: Path, ends: Ends = "unknown") -> list[Samples]:
@@ -37,19 +44,29 @@ def read(path: Path, ends: Ends = "unknown") -> list[Samples]:
         InputError: the file is missing, of another form, or holds invalid data; the message names file, row and column.
     """
     check_ending(path)
-    if path.is_dir():
-        raise InputError(f"{path}: a folder, not a file")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    check_regular(path)
     if path.stat().st_size == 0:
-        raise InputError(f"{path}: the file is empty (0 bytes)")
+        raise InputError(f"{shown(path)}: the file is empty (0 bytes)")
     match path.suffix.lower():
         case ".npz":
-            return _from_arrays(_read_npz(path), str(path), ends)
+            return _from_arrays(_read_npz(path), shown(path), ends)
         case ".csv":
-            return _from_table(_read_csv(path), str(path), ends)
+            return _from_table(_read_csv(path), shown(path), ends)
         case _:
-            return _from_table(_read_parquet(path), str(path), ends)
+            return _from_table(_read_parquet(path), shown(path), ends)
+
+
+def _check_count(values: int, path: Path) -> None:
+    """Refuse more numbers than a file of the largest size could hold as they are.
+
+    Raises:
+        InputError: there are more, be it that a small file unpacks to them.
+    """
+    if 8 * values > largest(DATA):
+        raise InputError(
+            f"{shown(path)}: it holds {8 * values / 2**20:.0f} MiB of numbers, at most {largest(DATA) // 2**20} are "
+            f"read; if it is meant to be so long, raise that with --largest-file or {LARGEST}"
+        )
 
 
 def read_all(paths: Sequence[Path], ends: Ends = "unknown") -> list[Samples]:
@@ -70,7 +87,7 @@ def check_ending(path: Path) -> None:
         InputError: it is not.
     """
     if path.suffix.lower() not in FORMATS:
-        raise InputError(f"{path}: the ending {path.suffix!r} is not one of {', '.join(FORMATS)}")
+        raise InputError(f"{shown(path)}: the ending {shown(path.suffix)!r} is not one of {', '.join(FORMATS)}")
 
 
 def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, source: str, ends: Ends) -> list[Samples]:
@@ -81,8 +98,13 @@ def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, sou
     if labels is None:
         return [Samples(t, u, v, f, None, source, ends)]
     found = []
-    for label in dict.fromkeys(labels.tolist()):
-        rows = labels == label
+    names, first, group = np.unique(labels, return_index=True, return_inverse=True)
+    if 2 * len(names) > len(labels):
+        alone = names[np.argmin(np.bincount(group))]
+        raise InputError(f"{source}, trajectory {alone}: it has 1 row(s) of data; a motion needs at least 2")
+    members = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
+    for number in np.argsort(first):
+        label, rows = names[number], members[number]
         own_v, own_f = (None if array is None else array[rows] for array in (v, f))
         found.append(Samples(t[rows], u[rows], own_v, own_f, None, f"{source}, trajectory {label}", ends))
     return found
@@ -92,55 +114,98 @@ def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, sou
 
 
 def _read_parquet(path: Path) -> pandas.DataFrame:
+    """Return a table of floats, NaN where a value is missing, and of labels."""
     import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
     try:
-        table = pd.read_parquet(path)
+        with reading(path, DATA) as handle, pq.ParquetFile(handle) as file:
+            schema, about = file.schema_arrow, file.metadata
+            _check_count(about.num_rows * about.num_columns, path)
+            header = _named_once([name.strip() for name in schema.names], path)
+            _check_header(header, shown(path))
+            columns = {}
+            for name, kind, column in zip(header, schema.types, file.read().itercolumns(), strict=True):
+                if name == "trajectory" and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+                    columns[name] = column.to_numpy()
+                    continue
+                _check_type(kind, name, path)
+                columns[name] = column.cast(pa.float64()).to_numpy()
+    except InputError:
+        raise
+    # A damaged file fails in many ways.
     except Exception as error:
-        raise InputError(f"{path}: not a Parquet file: {str(error).splitlines()[0]}") from None
-    table.columns = pd.Index(_named_once([str(column).strip() for column in table.columns], path))
-    return table
+        raise InputError(f"{shown(path)}: not a Parquet file: {str(error).partition(chr(10))[0]}") from None
+    if "trajectory" in columns:
+        columns["trajectory"] = columns["trajectory"].astype(str)
+    return pd.DataFrame(columns)
+
+
+def _check_type(kind: pyarrow.DataType, name: str, path: Path) -> None:
+    import pyarrow as pa
+
+    if pa.types.is_temporal(kind):
+        raise InputError(f"{shown(path)}: column {name}: dates are not numbers; give the time since the first row")
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind)):
+        raise InputError(
+            f"{shown(path)}: row 1, column {name}: it holds values of type {kind}, not numbers; write it as float64"
+        )
 
 
 def _read_csv(path: Path) -> pandas.DataFrame:
+    """Return a table of texts, NaN where a cell is empty."""
     import pandas as pd
 
+    text = read_text(path, DATA).removeprefix("\ufeff")
+    _check_count(text.count(","), path)
     try:
         # The header is read as a row, so that a column that occurs twice is seen before pandas renames it.
-        raw = pd.read_csv(path, header=None, comment="#", skipinitialspace=True, dtype=str, encoding="utf-8")
+        raw = pd.read_csv(io.StringIO(text), header=None, comment="#", skipinitialspace=True, dtype=str)
     except pd.errors.EmptyDataError:
-        raise InputError(f"{path}: the file is empty; its first line must be a header such as t,u1,u2") from None
+        raise InputError(f"{shown(path)}: the file is empty; its first line must be a header such as t,u1,u2") from None
     except pd.errors.ParserError as error:
         reason = str(error).strip().splitlines()[0].removeprefix("Error tokenizing data. C error: ")
-        raise InputError(f"{path}: not a table: {reason}; every row needs as many values as the header") from None
-    except (UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"{path}: not a text file (UTF-8): {error}") from None
-    header = _named_once([str(name).strip() for name in raw.iloc[0]], path)
+        raise InputError(
+            f"{shown(path)}: not a table: {reason}; every row needs as many values as the header"
+        ) from None
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{shown(path)}: not a table: {error}") from None
+    header = _named_once([str(name).strip()[:MOST_IN_A_CELL] for name in raw.iloc[0]], path)
     body = raw.iloc[1:].reset_index(drop=True)
     body.columns = pd.Index(header)
     if body.iloc[:, -1].isna().any():
-        _refuse_short_rows(path, len(header))
+        _refuse_short_rows(text, len(header), path)
     return body
 
 
 def _named_once(header: list[str], path: Path) -> list[str]:
     """Return a header, unless a column occurs twice."""
+    seen = set()
     for name in header:
-        if header.count(name) > 1:
-            raise InputError(f"{path}: the column {name!r} occurs twice; leave one out")
+        if name in seen:
+            raise InputError(f"{shown(path)}: the column {_quoted(name)} occurs twice; leave one out")
+        seen.add(name)
     return header
 
 
-def _refuse_short_rows(path: Path, width: int) -> None:
+def _quoted(text: str) -> str:
+    """Return the beginning of a text of the user's in quotes."""
+    return repr(text if len(text) <= 40 else text[:37] + "...")
+
+
+def _refuse_short_rows(text: str, width: int, path: Path) -> None:
     """Refuse rows that end early, as in a file that was cut off; pandas fills them up with gaps."""
-    with path.open(encoding="utf-8", newline="") as lines:
-        rows = (row for row in csv.reader(line.partition("#")[0] for line in lines) if "".join(row).strip())
-        for number, row in enumerate(rows):
+    rows = csv.reader(line.partition("#")[0] for line in io.StringIO(text, newline=""))
+    try:
+        for number, row in enumerate(row for row in rows if "".join(row).strip()):
             if len(row) < width:
                 raise InputError(
-                    f"{path}: row {number}: it has {len(row)} value(s), the header {width}; the row was cut off, or a "
-                    "missing value needs its comma"
+                    f"{shown(path)}: row {number}: it has {len(row)} value(s), the header {width}; the row was cut "
+                    "off, or a missing value needs its comma"
                 )
+    except csv.Error as error:
+        raise InputError(f"{shown(path)}: line {rows.line_num}: {error}; a cell holds one number") from None
 
 
 def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Samples]:
@@ -178,7 +243,7 @@ def _check_header(columns: list[str], source: str) -> None:
     for column in columns:
         if not re.fullmatch(r"t|f|trajectory|(u|v|f|re|im)[1-9]\d{0,5}", column):
             raise InputError(
-                f"{source}: unknown column {column!r}; known: u1.., v1.., f1.. or f, re1.., im1.., t, trajectory"
+                f"{source}: unknown column {_quoted(column)}; known: u1.., v1.., f1.. or f, re1.., im1.., t, trajectory"
             )
 
 
@@ -187,14 +252,14 @@ def _numbers(table: pandas.DataFrame, column: str, source: str) -> ndarray:
     import pandas as pd
 
     given = table[column]
-    if pd.api.types.is_datetime64_any_dtype(given) or pd.api.types.is_timedelta64_dtype(given):
-        raise InputError(f"{source}: column {column}: dates are not numbers; give the time since the first row")
+    if given.dtype.kind == "f":
+        return given.to_numpy()
     values = pd.to_numeric(given, errors="coerce")
-    wrong = values.isna() & given.notna() & (given.astype(str).str.strip().str.lower() != "nan")
+    wrong = values.isna() & given.notna() & (given.str.strip().str.lower() != "nan")
     if wrong.any():
         row = int(np.flatnonzero(wrong.to_numpy())[0])
         raise InputError(
-            f"{source}: row {row + 1}, column {column}: {str(given.iloc[row])[:40]!r} is not a number; "
+            f"{source}: row {row + 1}, column {column}: {_quoted(given.iloc[row])} is not a number; "
             "leave the cell empty if the value is missing"
         )
     # pandas reads numbers in texts fast, but not to the last digit; Python does.
@@ -218,24 +283,59 @@ def _field(numbers: dict[str, ndarray], prefix: str, source: str) -> ndarray | N
 
 
 def _read_npz(path: Path) -> dict[str, ndarray]:
+    """Return the arrays, whose names, types and sizes are looked at before they are unpacked."""
     try:
-        # Opened here, so that it is closed when NumPy gives up.
-        with path.open("rb") as handle:
-            stored = np.load(handle, allow_pickle=False)
-            if not isinstance(stored, np.lib.npyio.NpzFile):
+        with reading(path, DATA) as handle:
+            if handle.peek(1)[:1] != b"P":  # type: ignore[attr-defined]
+                np.load(handle, allow_pickle=False)
                 raise ValueError("it holds one array without a name")
-            with stored:
-                return {name: stored[name] for name in stored.files}
+            with zipfile.ZipFile(handle) as archive:
+                members = {one.filename.removesuffix(".npy"): one for one in archive.infolist()}
+                if len(members) < len(archive.infolist()):
+                    raise ValueError("an array occurs twice")
+                _check_names(list(members), shown(path))
+                shapes = {name: _shape(archive, one, name, path) for name, one in members.items()}
+                _check_count(sum(int(np.prod(shape, dtype=object)) for shape in shapes.values()), path)
+                return {name: _array(archive, one) for name, one in members.items()}
+    except InputError:
+        raise
     # A damaged archive fails in many ways: zipfile's, zlib's, NumPy's.
     except Exception as error:
         reason = "it holds pickled objects, which are never loaded" if "pickle" in str(error).lower() else str(error)
         raise InputError(
-            f"{path}: not an NPZ file of plain arrays: {reason}; write it with numpy.savez(path, t=t, u=u)"
+            f"{shown(path)}: not an NPZ file of plain arrays: {reason}; write it with numpy.savez(path, t=t, u=u)"
         ) from None
 
 
+def _shape(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, path: Path) -> tuple[int, ...]:
+    """Return the shape that the head of an array tells.
+
+    Raises:
+        InputError: it is no array, or one of other things than numbers.
+        ValueError: it holds objects.
+    """
+    with archive.open(member) as file:
+        if file.read(len(np.lib.format.MAGIC_PREFIX)) != np.lib.format.MAGIC_PREFIX:
+            raise InputError(f"{shown(path)}: {name!r} is not an array; write it with numpy.savez(path, t=t, u=u)")
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        head: Any = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, kind = head(file)
+    if kind.hasobject:
+        raise ValueError("pickled objects")
+    if kind.kind not in ("fiuc" if name != "trajectory" else "fiuU") or kind.itemsize > 1000:
+        raise InputError(f"{shown(path)}: array {name}: its values are {kind}, not numbers")
+    return tuple(shape)
+
+
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> ndarray:
+    with archive.open(member) as file:
+        found: ndarray = np.lib.format.read_array(file, allow_pickle=False)
+        return found
+
+
 def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends) -> list[Samples]:
-    _check_arrays(arrays, source)
+    _check_times(arrays["t"], source)
     t, labels = arrays["t"], arrays.get("trajectory")
     u, v, f = (_matrix(arrays, name, source) for name in ("u", "v", "f"))
     assert u is not None
@@ -246,22 +346,22 @@ def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends) -> list[Sa
     return _trajectories({"t": t.astype(float), "u": u, "v": v, "f": f}, labels, source, ends)
 
 
-def _check_arrays(arrays: dict[str, ndarray], source: str) -> None:
-    """Refuse missing and unknown arrays, those that hold no numbers, and times that are complex or not (T,)."""
+def _check_names(names: Sequence[str], source: str) -> None:
+    """Refuse missing and unknown arrays."""
     for name in ("t", "u"):
-        if name not in arrays:
-            raise InputError(f"{source}: the array {name!r} is missing; there are: {', '.join(arrays) or 'none'}")
-    for name, array in arrays.items():
-        if name not in ("t", "u", "v", "f", "trajectory"):
-            raise InputError(f"{source}: unknown array {name!r}; known: t, u, v, f, trajectory")
-        if not isinstance(array, np.ndarray):
-            raise InputError(f"{source}: {name!r} is not an array; write it with numpy.savez(path, t=t, u=u)")
-        if name != "trajectory" and array.dtype.kind not in "fiuc":
-            raise InputError(f"{source}: array {name}: its values are {array.dtype}, not numbers")
-    if arrays["t"].dtype.kind == "c":
+        if name not in names:
+            raise InputError(f"{source}: the array {name!r} is missing; there are: {', '.join(map(_quoted, names))}")
+    for name in names:
+        if name not in ARRAYS:
+            raise InputError(f"{source}: unknown array {_quoted(name)}; known: {', '.join(ARRAYS)}")
+
+
+def _check_times(t: ndarray, source: str) -> None:
+    """Refuse times that are complex or not (T,)."""
+    if t.dtype.kind == "c":
         raise InputError(f"{source}: array t: times are real")
-    if arrays["t"].ndim != 1:
-        raise InputError(f"{source}: array t has shape {arrays['t'].shape}; it must be (T,)")
+    if t.ndim != 1:
+        raise InputError(f"{source}: array t has shape {t.shape}; it must be (T,)")
 
 
 def _matrix(arrays: dict[str, ndarray], name: str, source: str) -> ndarray | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from latticebench.systems.errors import InputError
+from latticebench.systems.files import one_sentence, read_text, shown
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -18,13 +19,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file.
 
     Raises:
-        InputError: it is missing, is not text, or is not TOML.
+        InputError: it is missing, too long, not a regular file, not text, or not TOML.
     """
+    text = read_text(path)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file (UTF-8)") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not TOML: {error}") from None
+        return tomllib.loads(text)
+    # A number of too many digits is a ValueError, too.
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{shown(path)}: not TOML: {one_sentence(error)}") from None

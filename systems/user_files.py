@@ -10,6 +10,7 @@ from typing import Any
 
 from latticebench.systems.effects import CATALOGUE, Effect
 from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.files import check_regular
 from latticebench.systems.lattice import Initial, Library, System, library
 from latticebench.systems.parser import TermError
 from latticebench.systems.toml import read_toml
@@ -28,8 +29,6 @@ def load_system(path: Path) -> System:
     Raises:
         InputError: the file is missing or does not hold a valid system.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
     if path.suffix == ".py":
         found = getattr(load_module(path), "SYSTEM", None)
         if not isinstance(found, System):
@@ -49,8 +48,7 @@ def load_module(path: Path) -> Any:
     Raises:
         InputError: the file is missing or fails when it is imported.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    check_regular(path)
     spec = importlib.util.spec_from_file_location(f"latticebench_user_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
@@ -64,8 +62,11 @@ def load_module(path: Path) -> Any:
             spec.loader.exec_module(module)
         finally:
             sys.dont_write_bytecode = before
-    except (Exception, SystemExit) as error:
-        del sys.modules[spec.name]
+    # Code of the user's may raise anything; Ctrl-C is no fault of its own.
+    except BaseException as error:
+        sys.modules.pop(spec.name, None)
+        if isinstance(error, KeyboardInterrupt):
+            raise
         if isinstance(error, InputError):
             raise InputError(f"{path}: {error}") from error
         raise InputError(f"{path}: it cannot be imported: {type(error).__name__}: {error}") from error

@@ -6,8 +6,11 @@ packages are imported inside the function, so that `--help`, `list` and tab comp
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Annotated
 
@@ -16,7 +19,8 @@ import typer
 import latticebench
 from latticebench.bench.cli import compare, data, diagnose, figures, fit, limit, listing, run, schema, simulate, table
 from latticebench.bench.threads import prefer_one_thread
-from latticebench.systems.errors import InputError
+from latticebench.systems.errors import InputError, printable
+from latticebench.systems.files import LARGEST
 
 app = typer.Typer(
     name="latticebench",
@@ -37,11 +41,20 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def program(
-    version: Annotated[
+    version: Annotated[  # noqa: ARG001
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
     ] = False,
+    largest_file: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=10**8, metavar="MIB", help="Read files up to this size; 512 of data, 16 of texts if not given."
+        ),
+    ] = None,
 ) -> None:
     """Find the equations of motion of nonlinear lattices from data, and measure how well each method does it."""
+    if largest_file is not None:
+        # The environment, since worker processes read files, too.
+        os.environ[LARGEST] = str(largest_file)
 
 
 app.command("list", epilog=listing.EPILOG)(listing.list_)
@@ -60,8 +73,14 @@ app.command(epilog=schema.EPILOG)(schema.schema)
 def main() -> None:
     """Run the command line; bad input is one line on standard error and exit code 2."""
     prefer_one_thread()
+    # What NumPy remarks on its way to a refusal is no help to anybody; a file's name may be of any bytes.
+    warnings.filterwarnings("ignore", category=RuntimeWarning)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         code = app(standalone_mode=False)
+        sys.stdout.flush()
     except InputError as error:
         _complain(str(error))
         code = 2
@@ -73,6 +92,13 @@ def main() -> None:
         # The reader (head, a pager) has seen enough; Python would complain once more on exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+    except OSError as error:
+        # Files of the user's are read and written with errors of their own; what is left is standard output.
+        if error.errno not in (errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EFBIG):
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _complain(f"standard output cannot be written: {error.strerror}")
+        code = 2
     except Exception as error:
         # Usage errors of the command-line library; anything else is a fault of ours and keeps its traceback.
         message: Callable[[], str] | None = getattr(error, "format_message", None)
@@ -87,4 +113,4 @@ def main() -> None:
 
 
 def _complain(text: str) -> None:
-    print("error: " + " ".join(text.splitlines()), file=sys.stderr)
+    print("error: " + printable(" ".join(text.splitlines())), file=sys.stderr)

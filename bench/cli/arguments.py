@@ -55,7 +55,7 @@ def case_of(**given: Any) -> FitCase:
     from latticebench.bench.fitting import FitCase
 
     try:
-        return FitCase(**{"library": "", "label": "", "method": "", **given})
+        return FitCase(**{"library": "", "label": "", "method": "", "memory_limit": 2**30, **given})
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"--{first['loc'][0]}: {first['msg'].lower()}, it is {first['input']!r}") from None

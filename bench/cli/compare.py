@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from latticebench.systems.errors import printable
+
 EPILOG = "Example:  latticebench compare results/default runs/default"
 
 
@@ -29,11 +31,11 @@ def compare(
     else:
         for name, frame in (("worse", found.worse), ("better", found.better)):
             for _, row in frame.iterrows():
-                print(f"{name}: {row['case']}: {row['old']} -> {row['new']}")
+                print(printable(f"{name}: {row['case']}: {row['old']} -> {row['new']}"))
         for name in found.gone:
-            print(f"gone: {name}")
+            print(printable(f"gone: {name}"))
         for name in found.fresh:
-            print(f"new: {name}")
+            print(printable(f"new: {name}"))
         print(
             f"{len(found.worse)} worse, {len(found.better)} better, {found.same} the same "
             f"(within a factor of {factor:g})"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from latticebench.bench.cli.arguments import asked, told
-from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, complete_systems
+from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, check_places, complete_systems, place
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def diagnose(
     ] = None,
     json_out: JsonOut = None,
     html_out: Annotated[
-        Path | None, typer.Option("--html", metavar="OUT", help="Write one HTML file with pictures.")
+        Path | None, typer.Option("--html", metavar="OUT", parser=place, help="Write one HTML file with pictures.")
     ] = None,
 ) -> None:
     """Find what a declared equation lacks: trace its residual to an effect, add it, show the error before and after."""
@@ -69,6 +69,7 @@ def diagnose(
     from latticebench.systems.readers import read_all
     from latticebench.systems.user_files import load_effects
 
+    check_places([*files, *(holdout or ()), effects, system], json=json_out, html=html_out)
     known, declared, order = _declared(system, terms, order)
     catalogue = (*CATALOGUE, *(load_effects(effects) if effects is not None else ()))
     ends = ends or ("unknown" if known is None else known.ends)
@@ -126,24 +127,41 @@ def _check_field(known: System | None, data: Sequence[Samples]) -> None:
 
 
 def _report(found: Diagnosis, json_out: str | None, html_out: Path | None, *, interrupted: bool) -> None:
-    """Show a diagnosis on the screen, and write it as JSON and as a page."""
+    """Show a diagnosis on the screen, and write it as JSON and as a page.
+
+    Raises:
+        InputError: a file cannot be written; the others are, and the screen has it all.
+    """
     from latticebench.bench.report.content import content, diagnosis_document
     from latticebench.bench.report.document import provenance, to_json
+    from latticebench.bench.report.text import show
     from latticebench.systems.files import write_text
 
     report, about = content(found, interrupted=interrupted), provenance()
+    text = "" if json_out is None else to_json(diagnosis_document(report, about))
+    failures: list[str] = []
     # Files first: whoever reads the screen may stop reading.
+    if json_out is not None and json_out != "-":
+        with _kept(failures):
+            write_text(Path(json_out), text)
     if html_out is not None:
         from latticebench.bench.report.curves import curves
         from latticebench.bench.report.page import write_page
 
-        write_page(report, curves(found), about, html_out)
-    if json_out is not None:
-        text = to_json(diagnosis_document(report, about))
-        if json_out == "-":
-            print(text, end="")
-            return
-        write_text(Path(json_out), text)
-    from latticebench.bench.report.text import show
+        with _kept(failures):
+            write_page(report, curves(found), about, html_out)
+    if json_out == "-":
+        print(text, end="")
+    else:
+        show(report)
+    if failures:
+        raise InputError("; ".join(failures))
 
-    show(report)
+
+@contextmanager
+def _kept(failures: list[str]) -> Iterator[None]:
+    """Keep the message of a place that fails: hours of work must not be lost to it."""
+    try:
+        yield
+    except InputError as error:
+        failures.append(str(error))

@@ -7,12 +7,16 @@ from typing import Annotated
 
 import typer
 
+from latticebench.bench.cli.options import place
+
 EPILOG = "Example:  latticebench figures runs/default --out results/default"
 
 
 def figures(
     folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
-    out: Annotated[Path | None, typer.Option(help="Where to write them; DIR/figures if not given.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(parser=place, metavar="DIR", help="Where to write them; DIR/figures if not given.")
+    ] = None,
     only: Annotated[
         list[str] | None, typer.Option(help="Draw this kind of figure alone; may be given several times.")
     ] = None,

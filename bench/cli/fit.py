@@ -18,7 +18,9 @@ from latticebench.bench.cli.options import (
     Settings,
     SystemOption,
     Terms,
+    check_places,
     complete_methods,
+    named,
 )
 
 EPILOG = (
@@ -35,7 +37,13 @@ def fit(
     terms: Terms = None,
     order: Order = None,
     method: Annotated[
-        str | None, typer.Option(help="A name from `list methods`, or a .py file.", autocompletion=complete_methods)
+        str | None,
+        typer.Option(
+            help="A name from `list methods`, or a .py file.",
+            autocompletion=complete_methods,
+            parser=named,
+            metavar="NAME",
+        ),
     ] = None,
     given: Settings = None,
     ends: Annotated[
@@ -51,9 +59,12 @@ def fit(
     from latticebench.systems.files import write_text
     from latticebench.systems.readers import read_all
 
-    method = method or methods.DEFAULT
-    chosen = make(methods.find(method), pairs(given))
-    _, candidates, order = asked(system, library, terms, order)
+    method = methods.DEFAULT if method is None else method
+    check_places([*files, system, method], json=json_out)
+    # What a file of the user's prints is for people, not for a program that reads the result.
+    with redirect_stdout(sys.stderr):
+        chosen = make(methods.find(method), pairs(given))
+        _, candidates, order = asked(system, library, terms, order)
     data = read_all(files, ends)
     with (
         told(data, method, f"method {method!r}"),

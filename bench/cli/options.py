@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -50,6 +51,44 @@ def suite_files() -> list[Path]:
     return sorted(Path(__file__).parents[1].glob("suites/*.toml"))
 
 
+def named(text: str) -> str:
+    """Return a name or path that is given.
+
+    Raises:
+        typer.BadParameter: it is empty.
+    """
+    if not text.strip() or "\0" in text:
+        raise typer.BadParameter("it is empty; give a name, or leave the option out")
+    return text
+
+
+def place(text: str | Path) -> Path:
+    """Return a path that is given; an empty one would be the working folder.
+
+    Raises:
+        typer.BadParameter: it is empty.
+    """
+    return Path(named(str(text)))
+
+
+def check_places(inputs: Iterable[Path | str | None], **outputs: Path | str | None) -> None:
+    """Make sure, before any work, that the outputs of a command can be written and replace none of its inputs.
+
+    Args:
+        inputs: files that the command reads, and names of systems and methods that may be files; None for none.
+        outputs: by their options; None and "-" (the screen) for none.
+
+    Raises:
+        InputError: an output is not as it should be, see `latticebench.systems.files.check_outputs`.
+    """
+    from latticebench.bench.case import code_file
+    from latticebench.systems.files import check_outputs
+
+    read = [Path(code_file(one) or one if isinstance(one, str) else one) for one in inputs if one is not None]
+    given = {f"--{name}": Path(path) for name, path in outputs.items() if path not in (None, "-")}
+    check_outputs(given, read)
+
+
 SystemName = Annotated[
     str, typer.Argument(help="A name from `list systems`, or a .py or .toml file.", autocompletion=complete_systems)
 ]
@@ -60,6 +99,8 @@ SystemOption = Annotated[
 Library = Annotated[str | None, typer.Option(help="A library of the system.", autocompletion=complete_libraries)]
 Terms = Annotated[str | None, typer.Option(help="Terms of your own, with ; between them.")]
 Order = Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Go on, however much time and memory it may take.")]
 JsonOut = Annotated[
-    str | None, typer.Option("--json", metavar="OUT", help="Write it as JSON to a file, or - for the screen.")
+    str | None,
+    typer.Option("--json", metavar="OUT", parser=named, help="Write it as JSON to a file, or - for the screen."),
 ]

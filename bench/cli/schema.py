@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from latticebench.bench.cli.options import place
 from latticebench.systems.errors import unknown
 
 EPILOG = "Example:  latticebench schema diagnosis"
@@ -16,7 +17,8 @@ PUBLISHED = Path(__file__).parents[1] / "report" / "schemas"
 def schema(
     name: Annotated[str | None, typer.Argument(help="A kind of document; without it all are listed.")] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write it, or without a name all of them, into this folder.")
+        Path | None,
+        typer.Option(parser=place, metavar="DIR", help="Write it, or without a name all of them, into this folder."),
     ] = None,
 ) -> None:
     """Print the JSON Schema of a document that a command writes with --json."""

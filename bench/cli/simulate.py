@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 import typer
 
 from latticebench.bench.cli.arguments import case_of, numbers
-from latticebench.bench.cli.options import KnownEnds, Settings, SystemName
+from latticebench.bench.cli.options import KnownEnds, Settings, SystemName, Yes, check_places, place
 from latticebench.systems.errors import unknown
+from latticebench.systems.files import shown
 
 EPILOG = (
     "Example:  latticebench simulate phi4 --set C=2 --set v=0.5 --sites 31 --samples 50 --noise 0.01 --seed 1 "
@@ -19,7 +20,7 @@ EPILOG = (
 
 def simulate(
     system: SystemName,
-    out: Annotated[Path, typer.Option(help="The file to write: .csv, .npz or .parquet.")],
+    out: Annotated[Path, typer.Option(parser=place, metavar="FILE", help="The file to write: .csv, .npz or .parquet.")],
     given: Settings = None,
     sites: Annotated[int | None, typer.Option(help="Number of sites N.")] = None,
     samples: Annotated[int, typer.Option(help="Number of sample times.")] = 50,
@@ -37,13 +38,16 @@ def simulate(
         Literal["rk4", "bdf", "dop853"] | None, typer.Option(help="The system's own (the paper's) if not given.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise, gaps and uneven times.")] = 1,
+    yes: Yes = False,
 ) -> None:
     """Simulate a system and write samples of it."""
     from latticebench import systems
+    from latticebench.bench.effort import check_size
     from latticebench.bench.fitting import samples as make_samples
     from latticebench.systems.readers import FORMATS
     from latticebench.systems.writers import write
 
+    check_places([system], out=out)
     found = systems.find(system)
     if out.suffix.lower() not in FORMATS:
         raise unknown("ending", out.suffix, FORMATS, str(out))
@@ -52,10 +56,12 @@ def simulate(
         missing=missing, trajectories=trajectories, velocities=velocities, ends=ends, initial=initial,
         integrator=integrator, seed=seed,
     )  # fmt: skip
+    if not yes:
+        check_size(case, case.sites or found.sites, system)
     data = make_samples(case, Path())
     write([one.observed() for one in data], out)
     listed = ", ".join(f"{name}={value:g}" for name, value in found.with_parameters(case.parameters).items())
     print(
-        f"{out}: {found.name} ({listed}), {data[0].sites} sites, {len(data[0].t)} samples x {len(data)} trajectories, "
-        f"noise {noise:g}"
+        f"{shown(out)}: {found.name} ({listed}), {data[0].sites} sites, {len(data[0].t)} samples x {len(data)} "
+        f"trajectories, noise {noise:g}"
     )

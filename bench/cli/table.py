@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from latticebench.bench.cli.options import place
 from latticebench.systems.errors import unknown
+from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
     from latticebench.bench.store import Shard, Store
@@ -18,7 +20,10 @@ EPILOG = "Example:  latticebench table runs/default --out results/default"
 
 def table(
     folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
-    out: Annotated[Path | None, typer.Option(help="Publish the tables here, as CSV, Markdown and LaTeX.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(parser=place, metavar="DIR", help="Publish the tables here, as CSV, Markdown and LaTeX."),
+    ] = None,
     value: Annotated[str, typer.Option(help="Which score of fits to show.")] = "e2",
     only: Annotated[
         list[str] | None, typer.Option(help="Publish this table alone; may be given several times.")
@@ -40,7 +45,7 @@ def table(
         kinds.show(store, value=value)
     if out is not None:
         for path in kinds.publish(store, out, only):
-            print(path, file=sys.stderr if as_json else sys.stdout)
+            print(shown(path), file=sys.stderr if as_json else sys.stdout)
 
 
 def document(store: Store, shard: Shard | None = None) -> str:
@@ -51,5 +56,6 @@ def document(store: Store, shard: Shard | None = None) -> str:
     from latticebench.bench.report.outputs import run_document
     from latticebench.bench.store import WHOLE
 
-    about = describe(store.origins(), store.about(), store.seeds())
-    return to_json(run_document(kinds.rows(store, shard or WHOLE), about))
+    rows = kinds.rows(store, shard or WHOLE)
+    with store.sound():
+        return to_json(run_document(rows, describe(store.origins(), store.about(), store.seeds())))

@@ -8,10 +8,12 @@ from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from latticebench.bench.report.mathematics import written
+from latticebench.systems.errors import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
+    from rich.text import Text as RichText
 
     from latticebench.bench.case import Case
     from latticebench.bench.limit import Design, Limit
@@ -31,15 +33,21 @@ def console() -> Console:
 def show_rows(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a table; lists and dictionaries within a cell are written out."""
     from rich import box
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD)
     for name in columns:
-        table.add_column(str(name), overflow="fold")
+        table.add_column(_shown(str(name)), overflow="fold")
     for row in rows:
-        table.add_row(*(escape(_text(value)) for value in row))
+        table.add_row(*(_shown(_text(value)) for value in row))
     console().print(table)
+
+
+def _shown(text: str) -> RichText:
+    """Return a text as it is, whatever markup it looks like."""
+    from rich.text import Text
+
+    return Text("\n".join(map(printable, text.split("\n"))))
 
 
 def _text(value: Any) -> str:
@@ -106,7 +114,9 @@ def show_results(results: Iterable[Mapping[str, Any]], value: str = "e2") -> Non
     show_rows(list(arranged.columns), arranged.to_numpy().tolist())
     for _, row in every[~every["status"].isin(["ok", "skipped"])].iterrows():
         place = f"{row['data']} | {row['library']} | {row['method']} | seed {row['seed']}"
-        screen.print(f"{row['status']}: {place}: {row['reason']}", style="red", highlight=False, markup=False)
+        screen.print(
+            printable(f"{row['status']}: {place}: {row['reason']}"), style="red", highlight=False, markup=False
+        )
     show_note(f"{value}: {MEANINGS.get(value, 'median over seeds')}")
 
 
@@ -168,7 +178,7 @@ class Bar:
         if result["status"] not in ("ok", "skipped") or not self.progress.console.is_terminal:
             reason = f": {result['reason']}" if result["reason"] else ""
             line = f"{result['status']}: {case.title}{reason}"
-            self.progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
+            self.progress.console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
         self.progress.advance(self.task)
         self._name_running()
 
@@ -192,13 +202,12 @@ def progress(total: int) -> Iterator[Callable[[], None]]:
 def progress_bar(total: int) -> Iterator[Bar]:
     """Show a run's progress on standard error while the block lasts."""
     from rich.console import Console
-    from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TimeRemainingColumn
     from rich.text import Text
 
     class Running(ProgressColumn):
         def render(self, task: Task) -> Text:
-            return Text(escape(task.fields["running"]), style="dim", overflow="ellipsis", no_wrap=True)
+            return Text(printable(task.fields["running"]), style="dim", overflow="ellipsis", no_wrap=True)
 
     columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeRemainingColumn(), Running())
     progress = Progress(*columns, console=Console(stderr=True), transient=True)

@@ -156,7 +156,12 @@ def test_the_limit_of_a_file_is_near_the_one_of_the_system_that_it_came_from(fol
     assert found["noise"] == pytest.approx(0.001, rel=0.1)
     assert found["relative"] == pytest.approx(told["relative"], rel=0.1)
     assert found["needed"]["span"] is not None
-    assert "within reach as things are" in succeed("limit", "phi4.csv", "--ends", "free", *about[:4], cwd=folder)
+    shown = succeed("limit", "phi4.csv", "--ends", "free", *about[:4], cwd=folder)
+    assert "within reach as things are" in shown
+    assert "noise of all sensors: 0.0" in shown
+    assert "these bounds do not hold" not in shown
+    poor = succeed("limit", "phi4.csv", "--ends", "free", "--order", 2, "--terms", "u[n+1]+u[n-1]-2*u[n]", cwd=folder)
+    assert "times the noise: these bounds do not hold; see `latticebench diagnose`" in " ".join(poor.split())
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,11 @@ import pytest
 
 from latticebench import systems
 from latticebench.bench import cli
+from latticebench.bench.report import page
 from latticebench.bench.trials.specimen import Conditions, make
 from latticebench.diagnosis import repair
 from latticebench.systems.effects import CATALOGUE
+from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.readers import read
 from latticebench.systems.samples import Samples
@@ -211,3 +213,17 @@ def test_help_loads_nothing_heavy() -> None:
     )
     for command in (["diagnose", "--help"], ["data"], ["data", "--json"], ["data", "take", "--help"]):
         subprocess.run([sys.executable, "-c", program.format(command=command)], check=True, capture_output=True)
+
+
+def test_a_page_that_cannot_be_written_loses_neither_the_json_nor_the_screen(
+    typed: Typed, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise InputError("found.html: cannot be written: No space left on device")
+
+    monkeypatch.setattr(page, "write_page", full)
+    code, out, err = typed("diagnose", "damped.csv", "--system", "phi4", "--json", "kept.json", "--html", "found.html")
+    assert code == 2
+    assert err == "error: found.html: cannot be written: No space left on device\n"
+    assert out.startswith("What the equation lacks: ")
+    assert json.loads((folder / "kept.json").read_text())["verdict"] == "explained"

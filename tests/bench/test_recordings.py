@@ -100,7 +100,7 @@ def test_another_file_at_the_place_is_kept(own: Path) -> None:
 
 @pytest.mark.parametrize("missing", ["nothing.csv", "."])
 def test_what_is_no_file_cannot_be_taken(own: Path, missing: str) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match=r"no such file|a folder"):
         take("swing", Path(missing))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -20,6 +21,7 @@ import pytest
 from latticebench import systems
 from latticebench.bench.case import Folders
 from latticebench.bench.fitting import FitCase
+from latticebench.bench.leases import Leases
 from latticebench.bench.limit import bound_of
 from latticebench.bench.run import Tally, run
 from latticebench.bench.store import FILE, Store, create, open_store
@@ -98,7 +100,7 @@ def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other
         assert "not finite" in found["empty", seed]["reason"]
         assert found["imaginary", seed]["status"] == found["odd", seed]["status"] == "failed"
         assert "real" in found["imaginary", seed]["reason"]
-        assert "JSON" in found["odd", seed]["reason"]
+        assert "status must be a text" in found["odd", seed]["reason"]
 
 
 def test_finished_cases_are_not_run_again_and_failures_only_when_asked(tmp_path: Path) -> None:
@@ -249,14 +251,38 @@ def test_ctrl_c_ends_at_once_with_the_finished_cases_kept(start_run: StartRun, t
     assert count(store) == 1
 
 
-def test_two_runs_on_one_store_do_not_corrupt_it(start_run: StartRun, tmp_path: Path) -> None:
-    hostile_suite(tmp_path / "s", {"good": "seconds = 0.1"}, seeds=str(list(range(10))))
+def test_two_runs_on_one_store_share_its_cases_and_do_not_corrupt_it(start_run: StartRun, tmp_path: Path) -> None:
+    diary = tmp_path / "diary"
+    hostile_suite(tmp_path / "s", {"good": f'seconds = 0.1, diary = "{diary}"'}, seeds=str(list(range(10))))
     runners = [start_run(tmp_path / "s" / "hostile.toml", tmp_path / "store") for _ in range(2)]
     for runner in runners:
         out, err = runner.communicate(timeout=PATIENCE)
         assert runner.returncode == 0, err
         assert b"10 cases (10 ok)" in out
     assert len(list(open_store(tmp_path / "store").results())) == 10
+    assert len(diary_lines(diary)) == 10
+
+
+def test_a_lease_ends_with_its_process_and_with_its_time(tmp_path: Path) -> None:
+    store = create(tmp_path)
+    mine, other = Leases(store), Leases(store)
+    assert mine.take("a")
+    assert mine.take("a")
+    assert not other.take("a")
+    mine.give_back("a")
+    assert other.take("a")
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        began = f"{psutil.Process(process.pid).create_time():.2f}"
+        third = Leases(store, owner=f"{platform.node()} {process.pid} {began} x")
+        assert third.take("b")
+        assert not mine.take("b")
+        process.kill()
+    assert mine.take("b")
+    far = Leases(store, owner="another machine 1 0.00 x")
+    assert far.take("c")
+    assert not mine.take("c")
+    store.connection.execute("UPDATE leases SET until = until - 3600")
+    assert mine.take("c")
 
 
 def test_a_method_that_writes_to_its_samples_harms_no_other(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
 """Reading: what was written is read to the last digit, and what is invalid is refused by its place."""
 
 import decimal
+import io
 import pickle
+import time
 import zipfile
 
 import numpy as np
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from latticebench.systems.errors import InputError
+from latticebench.systems.files import LARGEST
 from latticebench.systems.readers import FORMATS, read, read_all
 from latticebench.systems.samples import Samples
 from latticebench.systems.writers import write
@@ -362,6 +365,109 @@ def test_a_cut_parquet_is_refused(tmp_path):
     for end in range(1, len(whole), 101):
         path.write_bytes(whole[:end])
         refused(path, "Parquet")
+
+
+# Files made to harm
+
+
+def test_an_npz_is_weighed_before_it_is_unpacked(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, t=np.arange(3.0), u=np.zeros((3, 1)), spare=np.zeros(10**6))
+    refused(path, "unknown array 'spare'")
+
+    def archive(**members):
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+            for name, (head, body) in members.items():
+                content = io.BytesIO()
+                np.lib.format.write_array_header_1_0(content, {"fortran_order": False, **head})
+                file.writestr(f"{name}.npy", content.getvalue() + body)
+
+    def head(*shape, descr="<f8"):
+        return {"descr": descr, "shape": shape}
+
+    times = (head(3), np.arange(3.0).tobytes())
+    archive(t=times, u=(head(3, 10**12), b""))
+    refused(path, "MiB of numbers", "--largest-file")
+    archive(t=times, u=(head(3, 10**30), b""))
+    refused(path, "MiB of numbers")
+    archive(t=times, u=(head(3, -1), b""))
+    refused(path)
+    archive(t=times, u=(head(3, 5), b"\0" * 8))
+    refused(path)
+    archive(t=times, u=(head(3, 1, descr="|b1"), b"\1\1\1"))
+    refused(path, "array u", "bool")
+    archive(t=times, u=(head(3, 1, descr="<U100000"), b""))
+    refused(path, "array u")
+    with zipfile.ZipFile(path, "w") as file:
+        for name in ("t.npy", "u.npy"):
+            file.writestr(name, b"")
+        with pytest.warns(UserWarning, match="Duplicate"):
+            file.writestr("u.npy", b"")
+    refused(path, "occurs twice")
+
+
+def test_a_small_parquet_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "a.parquet"
+    pq.write_table(pa.table({"t": np.arange(2e5), "u1": np.zeros(200_000)}), path)
+    assert len(read(path)) == 1
+    monkeypatch.setenv(LARGEST, "2")
+    refused(path, "MiB of numbers", "--largest-file")
+    monkeypatch.setenv(LARGEST, "4")
+    assert len(read(path)) == 1
+    monkeypatch.setenv(LARGEST, "many")
+    with pytest.raises(InputError, match="whole number of MiB"):
+        read(path)
+
+
+@pytest.mark.parametrize("kind", [pa.bool_(), pa.binary(), pa.string(), pa.timestamp("s"), pa.duration("s"), pa.null()])
+def test_a_parquet_column_of_other_things_than_numbers_is_refused_by_its_type(tmp_path, kind):
+    path = tmp_path / "a.parquet"
+    pq.write_table(pa.table({"t": [0.0, 1.0], "u1": pa.array([None, None], kind)}), path)
+    refused(path, "column u1")
+
+
+@pytest.mark.parametrize("kind", [pa.int8(), pa.uint64(), pa.float16(), pa.decimal128(30, 3)])
+def test_a_parquet_column_of_any_numbers_may_have_gaps(tmp_path, kind):
+    path = tmp_path / "a.parquet"
+    values = np.array([1, 2, 4], np.float16) if kind == pa.float16() else [1, 2, 4]
+    column = pa.array(values).cast(kind) if kind != pa.float16() else pa.array(values)
+    pq.write_table(pa.table({"t": [0.0, 1.0, 2.0], "u1": column, "u2": pa.array([None, 3, None], pa.int64())}), path)
+    np.testing.assert_array_equal(read(path)[0].u, [[1, np.nan], [2, 3], [4, np.nan]])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t,u1\0\n0,1\n1,2\n", ["line 1", "not a text file"]),
+        ("t,u1\n0,1\n1,2\0\n", ["line 3", "not a text file"]),
+        (f"t,u1,u2\n0,1,2\n1,{'0' * 200_000}1\n", ["line 3", "one number"]),
+        (f"t,{'u' * 200_000}\n0,1\n1,2\n", ["unknown column"]),
+        ("t,u1\n0,1_0\n1,2\n", ["row 1", "'1_0'"]),
+        ("t,u1\n0,0x1A\n1,2\n", ["row 1", "'0x1A'"]),
+        ("t,u1\n0,\u0661\n1,2\n", ["row 1", "column u1"]),
+        (f"t,u1\n0,{'9' * 5000}\n1,2\n", ["row 1", "column u1"]),
+    ],
+    ids=["NUL in the header", "NUL in a cell", "long cell", "long name", "underscore", "hexadecimal", "digit", "huge"],
+)
+def test_a_cell_that_is_no_plain_number_is_told_by_its_place(tmp_path, text, words):
+    path = tmp_path / "bad.csv"
+    path.write_text(text, encoding="utf-8")
+    assert len(refused(path, *words)) < 1000
+
+
+def test_many_trajectories_are_split_in_no_time(tmp_path):
+    count = 20_000
+    u = np.arange(2.0 * count).reshape(-1, 1)
+    labels = np.repeat(np.arange(count)[::-1], 2)
+    np.savez(tmp_path / "a.npz", t=np.tile([0.0, 1.0], count), u=u, trajectory=labels)
+    began = time.process_time()
+    found = read(tmp_path / "a.npz")
+    assert time.process_time() - began < 20
+    assert len(found) == count
+    assert found[0].source.endswith(f"trajectory {count - 1}")
+    np.testing.assert_array_equal(found[-1].u[:, 0], u[-2:, 0])
+    np.savez(tmp_path / "b.npz", t=np.arange(3.0), u=np.ones((3, 1)), trajectory=np.array([1, 2, 3]))
+    refused(tmp_path / "b.npz", "trajectory 1", "1 row")
 
 
 # Several files

@@ -1,0 +1,68 @@
+"""A process that outlives the runner by a moment: when the runner is gone, however it ended, it ends the workers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import suppress
+from types import TracebackType
+
+# Nothing is imported from the working folder.
+START = "import sys; sys.path[:] = sys.argv[1].split('\\n'); from latticebench.bench.guardian import watch; watch()"
+
+
+class Guardian:
+    """The runner's end of it; a context that ends it."""
+
+    def __enter__(self) -> Guardian:
+        """Start it."""
+        command = [sys.executable, "-c", START, search_path()]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
+        return self
+
+    def watch_over(self, worker: int, mark: str) -> None:
+        """Tell it of a worker.
+
+        Args:
+            worker: the number of its process.
+            mark: see `bench.tree`.
+        """
+        self._tell(f"{worker} {mark}")
+
+    def forget(self, mark: str) -> None:
+        """Tell it that a worker has been ended."""
+        self._tell(mark)
+
+    def _tell(self, line: str) -> None:
+        assert self.process.stdin is not None
+        # Without it all goes on; it is needed only where the runner is killed.
+        with suppress(OSError):
+            self.process.stdin.write(line + "\n")
+            self.process.stdin.flush()
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
+        """Let it end the workers that are left, as there are where Ctrl-C comes twice, and itself."""
+        assert self.process.stdin is not None
+        with suppress(OSError):
+            self.process.stdin.close()
+        self.process.wait()
+
+
+def search_path() -> str:
+    """Return where Python looks for modules, as one argument for a process that is to look nowhere else."""
+    return "\n".join(path for path in sys.path if path)
+
+
+def watch() -> None:
+    """Read of workers until the runner's end of the pipe is closed, then end those that are left."""
+    from latticebench.bench.tree import end
+
+    workers: dict[str, int] = {}
+    for line in sys.stdin:
+        *number, mark = line.split()
+        if number:
+            workers[mark] = int(number[0])
+        else:
+            workers.pop(mark, None)
+    for mark, worker in workers.items():
+        end(worker, mark)

@@ -1,0 +1,121 @@
+"""Odd command lines: each works or is refused in one line, soon, and harms no file."""
+
+from __future__ import annotations
+
+import io
+import os
+import random
+import sys
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from latticebench.bench.cli import main
+from latticebench.bench.store import FILE
+
+posix = pytest.mark.skipif(os.name != "posix", reason="pipes and devices as POSIX has them")
+# Processor seconds after which a command of such a size counts as one that hangs.
+SOON = 20.0
+SUITE = """
+[methods.a]
+method = "zero"
+[[grid]]
+system = "phi4"
+sites = 5
+samples = 8
+span = 1.0
+libraries = ["lib1"]
+"""
+
+
+def latticebench(*arguments: str, cwd: Path) -> tuple[int, str]:
+    """Run a command within this process, and return its exit code and what it complains of."""
+    out, err, before, began = io.StringIO(), io.StringIO(), Path.cwd(), time.process_time()
+    os.chdir(cwd)
+    try:
+        with (
+            mock.patch.object(sys, "argv", ["latticebench", *arguments]), redirect_stdout(out), redirect_stderr(err),
+            mock.patch.dict(os.environ), pytest.raises(SystemExit) as end,
+        ):  # fmt: skip
+            main()
+    finally:
+        os.chdir(before)
+    assert time.process_time() - began < SOON
+    return int(end.value.code or 0), err.getvalue()
+
+
+WORDS = (
+    "", "-1", "0", "1", "2", "1e300", "inf", "nan", "x", "[/x]", "t.csv", "t.npz", "pipe.csv", "/dev/null", "/dev/zero",
+    "missing.csv", ".", "..", "/", "store", "s.toml", "u[n]", "u[n];u[n]", "1/0", "u[n]**1e9", "sin(", "phi4", "dnls",
+    "lib1", "free", "stlsq", "zero", "oracle", "-", "--", "\x1b[31m", "ü", "x" * 300, "a=1", "C=nan", "threshold=-1",
+    "=", "1" + "0" * 30, "K/N", "1/1", "2/3", "out.json", "o/p/q.json", "true",
+)  # fmt: skip
+SIMULATED = ("--set", "--sites", "--samples", "--span", "--noise", "--trajectories", "--initial")
+FITTED = ("--system", "--library", "--terms", "--order", "--ends", "--json")
+COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "simulate": (
+        ("phi4", "--sites", "5", "--samples", "8", "--out", "x.csv"),
+        (*SIMULATED, "--uneven", "--missing", "--ends", "--integrator", "--seed", "--out"),
+    ),
+    "fit": (
+        ("t.csv", "--system", "phi4", "--library", "lib1", "--ends", "free", "--method", "zero"),
+        (*FITTED, "--method", "--set", "--seed"),
+    ),
+    # Not from the system: the search for what an error would need takes long.
+    "limit": (("missing.csv", "--system", "phi4", "--library", "lib1"), (*FITTED, *SIMULATED, "--target")),
+    "diagnose": (("missing.csv", "--system", "phi4"), (*FITTED, "--effects", "--holdout", "--html")),
+    "table": (("store",), ("--out", "--value", "--only", "--json")), "figures": (("store",), ("--out", "--only")),
+    "compare": (("store", "store"), ("--factor", "--json")), "schema": ((), ("--out",)), "data": ((), ("--json",)),
+    "list": (("systems",), ("--json",)),
+    "run": (("s.toml", "--jobs", "1", "--results", "store"), ("--jobs", "--results", "--shard", "--data", "--json")),
+}  # fmt: skip
+
+
+def odd_command(draw: random.Random) -> list[str]:
+    name = draw.choice(sorted(COMMANDS))
+    usual, options = COMMANDS[name]
+    words = list(usual)
+    for _ in range(draw.randrange(4)):
+        match draw.randrange(3):
+            case 0 if words:
+                words[draw.randrange(len(words))] = draw.choice(WORDS)
+            case 1:
+                words += [draw.choice(options), draw.choice(WORDS)]
+            case _:
+                words.insert(draw.randrange(len(words) + 1), draw.choice(WORDS))
+    # Only what is small is run.
+    return [name, "s.toml", *(word for word in words if word != "s.toml")] if name == "run" else [name, *words]
+
+
+def survive_commands(folder: Path, seeds: range) -> None:
+    (folder / "s.toml").write_text(SUITE)
+    latticebench("run", "s.toml", "--jobs", "1", "--results", "store", cwd=folder)
+    for name in ("t.csv", "t.npz"):
+        latticebench("simulate", "phi4", "--sites", "5", "--samples", "12", "--out", name, cwd=folder)
+    os.mkfifo(folder / "pipe.csv")
+    before = {name: (folder / name).read_bytes() for name in ("s.toml", "t.csv", "t.npz")}
+    for seed in seeds:
+        command = odd_command(random.Random(seed))
+        code, err = latticebench(*command, cwd=folder)
+        assert code in (0, 1, 2), command
+        assert code != 2 or (err.startswith("error: ") and err.count("\n") == 1), (command, err)
+        changed = [name for name, content in before.items() if (folder / name).read_bytes() != content]
+        # Another simulation may be written where an older one is.
+        assert not changed or command[0] == "simulate", command
+        for name in changed:
+            (folder / name).write_bytes(before[name])
+        assert (folder / "store" / FILE).is_file(), command
+
+
+@posix
+def test_odd_command_lines_work_or_are_refused_in_one_line(tmp_path: Path) -> None:
+    survive_commands(tmp_path, range(40))
+
+
+@posix
+@pytest.mark.slow
+def test_many_odd_command_lines_work_or_are_refused_in_one_line(tmp_path: Path) -> None:
+    survive_commands(tmp_path, range(1000, 1300))

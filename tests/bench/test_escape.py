@@ -1,0 +1,64 @@
+"""Escaping: a text of a user's is shown as it is, and is nothing else to whoever reads the file."""
+
+from __future__ import annotations
+
+import io
+
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from latticebench.bench.escape import csv_cell, csv_table, csv_text, label, markdown
+from latticebench.bench.publish import render
+from latticebench.systems.errors import printable
+from latticebench.systems.files import shown
+
+ODD = st.text(alphabet="=+-@'\"|<>[]()`$_\\,;#\t\r\n\x1b\x00ab1.e \ud800é", max_size=12)
+
+
+@given(text=ODD)
+@settings(derandomize=True, max_examples=300, deadline=None)
+def test_a_cell_of_a_csv_file_is_no_formula_and_comes_back(text: str) -> None:
+    written = csv_table(pd.DataFrame({"a": [text], "b": [1.5]}))
+    found = pd.read_csv(io.StringIO(written), dtype=str, keep_default_na=False)["a"][0]
+    assert csv_text(found) == printable(text)
+    assert found[:1] not in tuple("=@\t\r")
+    if found[:1] in ("+", "-"):
+        float(found)
+
+
+@given(text=ODD)
+@settings(derandomize=True, max_examples=300, deadline=None)
+def test_a_cell_of_markdown_begins_no_element_is_no_link_and_ends_no_cell(text: str) -> None:
+    found = markdown(text)
+    assert "<a" not in found
+    assert "](" not in found
+    assert "\n" not in found
+    assert found.count("|") == found.count("\\|")
+
+
+@given(name=ODD, value=ODD)
+@settings(derandomize=True, max_examples=15, deadline=None)
+def test_a_table_of_odd_texts_has_its_lines_and_no_others(name: str, value: str) -> None:
+    frame = pd.DataFrame({"method": ["a", "b"], f"x{name}": [value, "1"]})
+    for form, remark, lines in (("csv", "#", 3), ("md", "-", 5), ("tex", "%", 8)):
+        text = render(frame, {"command": name, "settings": {name: value}}, form)
+        assert len([line for line in text.splitlines() if not line.startswith(remark)]) == lines, text
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [("a\nb", "a\\nb"), ("\x1b[31m", "\\x1b[31m"), ("\ud800", "\\ud800"), ("ü × −", "ü × −"), ("\u202e", "\\u202e")],
+)
+def test_what_steers_a_terminal_is_written_as_an_escape(text: str, wanted: str) -> None:
+    assert printable(text) == wanted
+
+
+def test_labels_of_figures_are_no_mathematics() -> None:
+    assert label("$x$") == r"\$x\$"
+    assert not label("_hidden").startswith("_")
+    assert csv_cell(-1.5) == -1.5
+    assert csv_cell("-1.5e-3") == "-1.5e-3"
+    assert csv_cell("-2*u[n]") == "'-2*u[n]"
+    assert shown("a\nb.csv") == "a\\nb.csv"

@@ -1,0 +1,199 @@
+"""Methods that misbehave side by side with a good one: each is a row with its reason, and nothing of them is left."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from latticebench.bench.run import run
+from latticebench.bench.store import create
+from latticebench.bench.suite import load
+from latticebench.systems.errors import InputError
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks, and looks at processes")
+
+METHOD = """
+import ctypes, os, signal, subprocess, sys, time
+from dataclasses import dataclass, replace
+from typing import ClassVar
+import numpy as np
+from latticebench.methods.method import Abilities, Fit
+
+MARKER = {marker!r}
+def sleeper(eats=0, **options):
+    program = f"import time; x = b'1' * {{eats}}; time.sleep(3600)"
+    return subprocess.Popen([sys.executable, "-c", program, MARKER], **options)
+
+{before}
+
+@dataclass(frozen=True)
+class Own:
+    name: ClassVar[str] = "own"
+
+    @property
+    def abilities(self):
+        return Abilities()
+
+    def fit(self, data, library, order, seed):
+        one = Fit(self.name, library, order, np.ones(len(library.terms)), 0.5)
+{within}
+        return one
+
+METHODS = (Own,)
+"""
+# What a method does when it is imported, what it does in its fit, the status of its row, and a part of its reason.
+DEEDS: dict[str, tuple[str, str, str, str]] = {
+    "prints when imported": ("print('{not json'); os.write(1, b'from below')", "", "ok", "from below"),
+    "hangs when imported": ("time.sleep(3600)", "", "timeout", "time limit of 2 s"),
+    "ends when imported": ("os._exit(0)", "", "died", "exit code 0"),
+    "exits when imported": ("sys.exit('enough')", "", "failed", "SystemExit"),
+    "is no Python": ("def", "", "failed", "SyntaxError"),
+    "lists nothing": ("", "pass\nMETHODS = ()\ndel METHODS\ndef nothing():", "failed", "it must define METHODS"),
+    "complex": ("", "return replace(one, coefficients=one.coefficients + 1j)", "failed", "must be real"),
+    "infinite": ("", "return replace(one, coefficients=one.coefficients * np.inf)", "failed", "not finite"),
+    "too many": ("", "return replace(one, coefficients=np.ones(1000))", "failed", "shape (1000,)"),
+    "texts": ("", "return replace(one, coefficients=np.array(['1'] * len(library.terms)))", "failed", "real numbers"),
+    "a list": ("", "return replace(one, coefficients=[1.0] * len(library.terms))", "failed", "NumPy array"),
+    "no fit": ("", "return {'coefficients': 1}", "failed", "it must return a Fit"),
+    "talks": ("", "return replace(one, status='x' * 10**8)", "failed", "at most 2000 characters"),
+    "objects": ("", "return replace(one, found={'a': object()})", "failed", "numbers and texts"),
+    "surrogates": ("", "return replace(one, status='\\ud800')", "ok", ""),
+    "other library": ("", "return replace(one, library=type(library)('x', library.terms[::-1]))", "failed", "another"),
+    "raises Ctrl-C": ("", "raise KeyboardInterrupt", "failed", "KeyboardInterrupt"),
+    "says nothing": (
+        "class Mute(Exception):\n    def __str__(self): raise Mute", "raise Mute", "failed", "Mute: it says nothing",
+    ),
+    "leaves a child": ("", "sleeper()", "ok", ""),
+    "leaves a session": ("", "sleeper(start_new_session=True)\nos.kill(os.getpid(), 9)", "died", "SIGKILL"),
+    "leaves an orphan": (
+        "",
+        "if not os.fork():\n    os.setsid()\n    sleeper(env={{}})\n    os._exit(0)\ntime.sleep(3600)",
+        "timeout", "time limit",
+    ),
+    "children eat": (
+        "", "many = [sleeper(eats=2**29) for _ in range(2)]\nmany[0].wait()", "memory", "900 MiB",
+    ),
+    "copies itself": ("", "os.fork()", "ok", ""),
+    "floods": ("", "while True: print('flood' * 1000)", "timeout", "flood"),
+    "closes all": ("", "os.closerange(3, 1000)", "died", "ended by itself"),
+    "answers itself": (
+        "", "for k in range(3, 9):\n    try: os.write(k, b'7\\n')\n    except OSError: pass", "failed", "no result",
+    ),
+    "crashes": ("", "ctypes.string_at(1)", "died", "SIGSEGV"),
+    "reads": ("", "input()", "failed", "EOFError"),
+    "asks for a thread": ("", "import threading\nthreading.Thread(target=time.sleep, args=(3600,)).start()", "ok", ""),
+}  # fmt: skip
+
+
+# The others are of the same kinds.
+QUICK = (
+    "prints when imported", "ends when imported", "is no Python", "complex", "objects", "leaves a session",
+    "leaves an orphan", "children eat", "floods", "answers itself",
+)  # fmt: skip
+
+
+def write_suite(folder: Path, marker: str, deeds: Sequence[str]) -> Path:
+    """Write each method to a file of its own, and a suite of them with a good one between every two."""
+    text = '[methods.good]\nmethod = "zero"\n[defaults]\nsystem = "phi4"\nsites = 5\nsamples = 8\nspan = 1.0\n'
+    text += 'libraries = ["lib1"]\ntime_limit = 3600\nmemory_limit = 900\n'
+    for number, name in enumerate(deeds):
+        before, within, status, _ = DEEDS[name]
+        body = METHOD.format(
+            marker=marker, before=before, within=textwrap.indent(within.replace("{{}}", "{}"), " " * 8)
+        )
+        if name == "lists nothing":
+            body = "pass\n"
+        (folder / f"m{number}.py").write_text(body)
+        text += f'[methods."{name}"]\nmethod = "m{number}.py"\n'
+        limit = "time_limit = 2\n" * (status == "timeout")
+        text += (
+            f'[[grid]]\n{limit}methods = ["{name}"]\n[[grid]]\nmethods = ["good"]\nseeds = [{number}]\nnoise = 0.01\n'
+        )
+    (folder / "hostile.toml").write_text(text)
+    return folder / "hostile.toml"
+
+
+def alive(marker: str) -> list[str]:
+    every = [one.info for one in psutil.process_iter(["cmdline", "status"])]
+    return [
+        " ".join(one["cmdline"])
+        for one in every
+        if marker in (one["cmdline"] or ()) and one["status"] != psutil.STATUS_ZOMBIE
+    ]
+
+
+def every_one_is_a_row(folder: Path, deeds: Sequence[str]) -> None:
+    marker = f"marker-{os.getpid()}-{time.monotonic_ns()}"
+    results, _ = run(load(str(write_suite(folder, marker, deeds))), create(folder / "store"), jobs=2)
+    found = {(one["case"]["label"], one["case"]["seed"]): one for one in results}
+    assert [found["good", number]["status"] for number in range(len(deeds))] == ["ok"] * len(deeds)
+    told = {name: (found[name, 1]["status"], found[name, 1]["reason"]) for name in deeds}
+    assert not {name: row for name, row in told.items() if row[0] != DEEDS[name][2] or DEEDS[name][3] not in row[1]}
+    assert alive(marker) == []
+
+
+def test_every_hostile_method_is_a_row_with_its_reason_and_nothing_of_it_is_left(tmp_path: Path, capfd: Any) -> None:
+    every_one_is_a_row(tmp_path, QUICK)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.slow
+def test_hostile_methods_of_many_more_kinds_are_rows_and_leave_nothing(tmp_path: Path) -> None:
+    every_one_is_a_row(tmp_path, list(DEEDS))
+
+
+def test_a_killed_run_leaves_no_process_of_a_method_behind(tmp_path: Path) -> None:
+    """Neither one in a session of its own, nor a worker that holds the interpreter's lock."""
+    marker = f"marker-{os.getpid()}-{time.monotonic_ns()}"
+    gate = f"open({str(tmp_path / 'gate')!r}, 'w').close()"
+    held = f"sleeper(start_new_session=True)\n{gate}\nctypes.PyDLL(None).sleep(9999)"
+    body = METHOD.format(marker=marker, before="", within=textwrap.indent(held, " " * 8))
+    (tmp_path / "m.py").write_text(body)
+    (tmp_path / "s.toml").write_text('[methods.a]\nmethod = "m.py"\n[[grid]]\nsystem = "phi4"\nlibraries = ["lib1"]\n')
+    options = ["run", "s.toml", "--jobs", "1"]
+    with subprocess.Popen([sys.executable, "-m", "latticebench", *options], cwd=tmp_path) as runner:
+        wait_for(lambda: (tmp_path / "gate").exists())
+        workers = psutil.Process(runner.pid).children(recursive=True)
+        assert alive(marker)
+        runner.kill()
+    wait_for(lambda: not alive(marker) and not any(one.is_running() for one in workers))
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 300
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.05)
+
+
+def test_a_suite_names_a_method_file_that_is_not_there(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(
+        '[methods.a]\nmethod = "gone.py"\n[[grid]]\nsystem = "phi4"\nlibraries = ["lib1"]\n'
+    )
+    with pytest.raises(InputError, match=r"methods\.a: .*gone\.py: no such file"):
+        load(str(tmp_path / "s.toml"))
+
+
+def test_nothing_is_imported_from_the_working_folder(tmp_path: Path) -> None:
+    for name in ("psutil", "numpy", "json", "pickle"):
+        (tmp_path / f"{name}.py").write_text(f"open('ran', 'w')\nraise RuntimeError({name!r})\n")
+    (tmp_path / "s.toml").write_text(
+        '[methods.a]\nmethod = "zero"\n[[grid]]\nsystem = "phi4"\nsites = 5\nsamples = 8\nspan = 1.0\n'
+        'libraries = ["lib1"]\n'
+    )
+    program = "import sys; sys.path.remove(''); from latticebench.bench.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "run", "s.toml", "--jobs", "1"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "1 cases (1 ok)" in done.stdout
+    assert not (tmp_path / "ran").exists()
