@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 # A size is at least this share of the level's root mean square: arithmetic with doubles is no more accurate.
 FLOOR = 1e-12
+# Where noise grows with the signal, at zero signal it is at least this share of its median; and the standard deviation
+# of a Gaussian over its median absolute value.
+AT_REST, ROBUST = 0.1, 1.4826
 # Below 2 degrees of freedom there is no variance; closer to 2 it rests on a handful of outliers.
 HEAVIEST = 2.5
 # Beyond, Student's t is a Gaussian for any record.
@@ -370,7 +373,7 @@ class _Task:
             found, cost = plain, self.cost(numbers, structure)[0]
         else:
             groups = self.groups(structure)[1]
-            bounds = [(np.log(self.floor), np.log(1e3))] * groups
+            bounds = [(np.log(least), np.log(1e3)) for least in self.least(structure)]
             bounds += [(np.log(1e-6), np.log(1e6))] * structure.growth
             bounds += [(1 / LIGHTEST, 1 / HEAVIEST)] * structure.tails
             bounds += [(LEAST_CORRELATED, MOST_CORRELATED)] * (groups * structure.memory)
@@ -380,6 +383,19 @@ class _Task:
             )  # fmt: skip
             found, cost = self.unpacked(np.asarray(result.x), structure), float(result.fun)
         return found, -len(self.value) * (cost + float(np.log(self.unit)))
+
+    def least(self, structure: Structure) -> list[float]:
+        """Return the least size of each group, divided by `unit`.
+
+        Of noise that grows with the signal it is a share of the residuals' scale: with none at zero signal the
+        likelihood has no bound, as readings near zero are then beyond all doubt.
+        """
+        group, groups = self.groups(structure)
+        if not structure.growth:
+            return [self.floor] * groups
+        parts = [np.abs(self.value[group == k]) for k in range(groups)]
+        scales = [ROBUST * float(np.median(one)) if len(one) else 0.0 for one in parts]
+        return [max(self.floor, AT_REST * one) for one in scales]
 
     def plain(self, structure: Structure) -> Noise:
         """Return white Gaussian noise: root mean squares of the residuals, `unit` for a sensor without any."""

@@ -194,7 +194,7 @@ class Search:
             fits += [found] if found is not None else []
         if not fits:
             return []
-        self.small = max(SMALL_NOISE * float(np.nanmin(fits[0].rms)), 1e-3 * SMALL_SHARE * problem.height)
+        self.small = self._small(fits[0])
         self._choose_structure(fits[0])
         return [fits[0], *fits]
 
@@ -240,6 +240,11 @@ class Search:
                 if found is not None:
                     yield found
 
+    def _small(self, fitted: Fitted) -> float:
+        """Return a size of u that does not matter beside the noise of the best sensor where the signal is least."""
+        least = min(float(np.nanmin(fitted.rms)), float(np.nanmin(fitted.noise.deviation())))
+        return max(SMALL_NOISE * least, 1e-3 * SMALL_SHARE * self.problem.height)
+
     def _choose_structure(self, fitted: Fitted) -> None:
         """Let the readings choose the parts of the noise model that all models of a horizon share."""
         from latticebench.diagnosis.noise import estimate
@@ -255,7 +260,7 @@ class Search:
 
     def _carried(self, last: Found, length: int) -> list[Fitted]:
         """Return the declared equation and the best models on a longer horizon."""
-        self.small = max(SMALL_NOISE * float(np.nanmin(last.models[0].rms)), 1e-3 * SMALL_SHARE * self.problem.height)
+        self.small = self._small(last.models[0])
         self._choose_structure(last.models[0])
         layout = self.layout(length)
         fits = [found for one in last.models if (found := self.carry(one, layout)) is not None]

@@ -269,3 +269,14 @@ def test_the_transposed_whitener_is_the_transposed_matrix():
     assert np.sum(z * whitener.apply(x)) == pytest.approx(np.sum(whitener.transposed(z) * x))
     many = draw.normal(size=(30, 3, 2))
     np.testing.assert_allclose(whitener.transposed(many)[..., 1], whitener.transposed(many[..., 1]), rtol=1e-14)
+
+
+def test_noise_that_grows_from_nothing_keeps_a_size_at_zero_signal():
+    """Without one, a reading that happens to lie at zero is beyond all doubt, and the likelihood has no bound."""
+    draw = np.random.default_rng(8)
+    rows = rows_of(400, 2)
+    level = 10 * np.sin(np.arange(400)[:, None] / 7 + np.array([0.0, 1.0]))
+    left = 0.01 * level * draw.normal(size=level.shape)
+    found = estimate(left, level, rows, structure=Structure(own_sizes=True, growth=True))
+    assert np.all(found.size > 0.05 * np.median(np.abs(left), axis=0))
+    assert found.growth == pytest.approx(0.01, rel=0.2)
