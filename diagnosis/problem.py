@@ -229,7 +229,7 @@ class Problem:
     @functools.cached_property
     def _rounded(self) -> bool:
         """Whether rounding makes most of the noise; of a regular motion it leaves lines at high multiples."""
-        pairs = zip(self.steps, self.noise, strict=False)
+        pairs = zip(self.steps, self.noise, strict=True)
         return any(step**2 / 12 > ROUNDED * size**2 for step, size in pairs)
 
     def locked(self, placed: Placed) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
@@ -140,6 +141,12 @@ def diagnose(
         _check_enough(problem)
         search = Search(problem, watcher or (lambda _: None))
         found = None
+
+        # Models are forecast once, to be named and to be reported.
+        @functools.cache
+        def foreseen(fitted: Fitted) -> list[Prediction]:
+            return predict(fitted, problem, held_out)
+
         recorded = sum(len(one.t) for one in shown)
         try:
             for step in search.horizons():
@@ -148,14 +155,14 @@ def diagnose(
                     found = step
             if found is None:
                 raise InputError(f"{shown[0].source}: the declared equation cannot be followed even over a few samples")
-            best = _named(search, found, held_out)
+            best = _named(search, found, foreseen)
         except KeyboardInterrupt:
             if found is None:
                 raise
             plain = Compared(found.models[0], (np.nan,) * len(found.models[0].model.effects), _none_equal(found))
-            raise Interrupted(_diagnosis(problem, found, plain, held_out, recorded)) from None
+            raise Interrupted(_diagnosis(problem, found, plain, foreseen, recorded)) from None
         search.say("forecasting")
-        return _diagnosis(problem, found, best, held_out, recorded)
+        return _diagnosis(problem, found, best, foreseen, recorded)
 
 
 def _none_equal(found: Found) -> tuple[tuple[str, ...], ...]:
@@ -177,18 +184,18 @@ def _check_enough(problem: Problem) -> None:
         )
 
 
-def _named(search: Search, found: Found, held_out: Sequence[Samples]) -> Compared:
+def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Prediction]]) -> Compared:
     """Return the best model after exchanges, without effects that make the forecast worse."""
     search.say("trying what could stand in the place of each effect")
     best = compared(search, found.models[0])
-    before, now = (pooled(predict(one, search.problem, held_out)) for one in (found.before, best.fitted))
+    before, now = (pooled(foreseen(one)) for one in (found.before, best.fitted))
     of_u = best.fitted.rms[: search.problem.chain.sites]
     least = rules.BEYOND_NOISE * float(np.sqrt(np.nanmean(of_u**2))) / search.problem.height
     while best.fitted.model.effects and now > max((1 + rules.WORSE) * before, least):
         search.say("the forecast is worse than before: trying without the weakest effect")
         weakest = int(np.argmin(best.evidence))
         fitted = search.without(best.fitted, weakest)
-        error = np.inf if fitted is None else pooled(predict(fitted, search.problem, held_out))
+        error = np.inf if fitted is None else pooled(foreseen(fitted))
         if fitted is None or not error < now:
             break
         kept = [k for k in range(len(best.evidence)) if k != weakest]
@@ -197,7 +204,9 @@ def _named(search: Search, found: Found, held_out: Sequence[Samples]) -> Compare
     return best
 
 
-def _diagnosis(problem: Problem, found: Found, best: Compared, held_out: Sequence[Samples], recorded: int) -> Diagnosis:
+def _diagnosis(
+    problem: Problem, found: Found, best: Compared, foreseen: Callable[[Fitted], list[Prediction]], recorded: int
+) -> Diagnosis:
     """Return the diagnosis with the errors before and after."""
     before, after = found.before, best.fitted
     if not after.model.effects:
@@ -219,7 +228,7 @@ def _diagnosis(problem: Problem, found: Found, best: Compared, held_out: Sequenc
         residual=both(lambda one: _over(one, noise)),
         rms=both(lambda one: float(np.sqrt(np.nanmean(one.followed.left**2)))),
         dynamics=both(lambda one: _dynamics(problem, one)),
-        forecasts=both(lambda one: predict(one, problem, held_out)),
+        forecasts=both(foreseen),
         criterion=(0.0, more * float(np.log(after.layout.readings())) - gain),
         declared=both(lambda one: np.array(one.model.coefficients[:count])),
         modes=(modes.of_recording(problem), modes.of_model(before), modes.of_model(after)),

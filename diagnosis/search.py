@@ -17,7 +17,7 @@ from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted, fit
 from latticebench.diagnosis.horizon import Layout, unread
 from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.noise import Structure
+from latticebench.diagnosis.noise import Structure, estimate
 from latticebench.diagnosis.problem import Problem, regressed, turned
 from latticebench.diagnosis.score import Scored, Tangent
 
@@ -135,7 +135,7 @@ class Search:
                 break
             before, fits = carried[0], list(carried[1:])
             self.say(f"following pieces of {waves:.3g} periods")
-            best = self._level(fits)
+            best = self._level(fits, before)
             base = self.value(best[0])
             models = tuple((_names(one.model), self.value(one) - base) for one in best)
             done = (*done, Horizon(best[0].longest, waves, models, self.tried.get(best[0].model.key, ())))
@@ -173,8 +173,7 @@ class Search:
 
     def layout(self, length: int) -> Layout:
         """Return pieces of a length: of all rows on long horizons, of some on short ones."""
-        longest = max(len(one.t) for one in self.problem.data)
-        most = None if length >= longest else max(ROWS, PIECES * length)
+        most = None if length >= self._longest else max(ROWS, PIECES * length)
         return Layout.of(self.problem, length, most, self.small)
 
     def _first(self, length: int) -> list[Fitted]:
@@ -247,8 +246,6 @@ class Search:
 
     def _choose_structure(self, fitted: Fitted) -> None:
         """Let the readings choose the parts of the noise model that all models of a horizon share."""
-        from latticebench.diagnosis.noise import estimate
-
         followed = fitted.followed
         found = estimate(followed.left, followed.level, fitted.rows).structure
         few = len(fitted.rms) <= FEW_SENSORS
@@ -299,14 +296,15 @@ class Search:
 
     # One horizon ------------------------------------------------------------------------------------------------------
 
-    def _level(self, fits: list[Fitted]) -> list[Fitted]:
-        """Return the best models of a horizon."""
+    def _level(self, fits: list[Fitted], before: Fitted) -> list[Fitted]:
+        """Return the best models of a horizon, where the declared equation alone leads to `before`."""
         pool: Pool = {}
         for one in fits:
             self._keep(pool, one)
         opened: set[tuple[str, ...]] = set()
-        # The declared equation is opened last: one effect may do what several of the leader do.
-        while todo := [one for one in (*self._leading(pool), fits[0]) if one.model.key not in opened]:
+        # The declared equation is opened last, if it can be followed: one effect may do what several of a model do.
+        last = [before] if before.longest == fits[0].longest else []
+        while todo := [one for one in (*self._leading(pool), *last) if one.model.key not in opened]:
             opened.add(todo[0].model.key)
             leader = self._leading(pool)[0]
             ahead = np.inf if todo[0] is leader else self.value(leader)
