@@ -49,7 +49,7 @@ def draw_all(
     results = [_labelled(one) for one in results]
     if "coefficients" in only:
         for name, group in panels(results).items():
-            written.append(_save(panel(group), folder / f"coefficients-{name}.png", about))
+            written.append(save(panel(group), folder / f"coefficients-{name}.png", about))
     table = cases(results)
     if ((table["status"] == "ok") & table["e2"].notna()).any():
         drawn: dict[str, Callable[[pd.DataFrame], Figure]] = {
@@ -59,7 +59,7 @@ def draw_all(
             drawn |= {"error-against-noise": error_against_noise, "cost": cost}
         for name, draw in drawn.items():
             if name in only:
-                written.append(_save(draw(table), folder / f"{name}.png", about))
+                written.append(save(draw(table), folder / f"{name}.png", about))
     return written
 
 
@@ -349,7 +349,12 @@ def _axes(width: float, height: float) -> tuple[Figure, Axes]:
     return plt.subplots(figsize=(width, height), layout="constrained")
 
 
-def _save(figure: Figure, path: Path, about: Mapping[str, Any]) -> Path:
+def save(figure: Figure, path: Path, about: Mapping[str, Any]) -> Path:
+    """Write a figure with its provenance, and close it.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     import matplotlib.pyplot as plt
 
     with whole(path) as temporary:

@@ -106,20 +106,41 @@ def render(frame: pd.DataFrame, about: Mapping[str, Any], form: str) -> str:
     head = lines(about)
     if form == "csv":
         return "".join(f"# {line}\n" for line in head) + csv_table(frame)
-    readable = _without_empty(frame.drop(columns=[name for name in ("identity", "settings") if name in frame]))
-    for name in readable.columns:
-        if pd.api.types.is_float_dtype(readable[name]):
-            readable[name] = [format_number(value) for value in readable[name]]
+    shown = readable(_without_empty(frame.drop(columns=[name for name in ("identity", "settings") if name in frame])))
     if form == "md":
-        quoted = readable.map(lambda value: markdown(str(value)))
-        if "term" in quoted:
-            # What stands between backticks is shown as it is, but for the end of a cell.
-            quoted["term"] = ["`" + str(term).replace("|", "\\|") + "`" for term in readable["term"]]
-        quoted.columns = pd.Index([markdown(str(name)) for name in quoted.columns])
-        about_it = "".join(f"- {markdown(line)}\n" for line in head)
-        return quoted.to_markdown(index=False, disable_numparse=True) + "\n\n" + about_it
-    readable.columns = pd.Index([printable(str(name)) for name in readable.columns])
-    return "".join(f"% {line}\n" for line in (NEEDS, *head)) + _latex(readable.map(lambda value: printable(str(value))))
+        return markdown_table(shown) + "\n\n" + "".join(f"{line}\n" for line in markdown_list(head))
+    shown.columns = pd.Index([printable(str(name)) for name in shown.columns])
+    return "".join(f"% {line}\n" for line in (NEEDS, *head)) + _latex(shown.map(lambda value: printable(str(value))))
+
+
+def readable(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table whose numbers that are not whole have two digits; nothing stands for one that is missing."""
+    shown = frame.copy()
+    for name in shown.columns:
+        if pd.api.types.is_float_dtype(shown[name]):
+            shown[name] = [format_number(value) for value in shown[name]]
+        elif shown[name].dtype == object:
+            shown[name] = [_readable(value) for value in shown[name]]
+    return shown
+
+
+def _readable(value: Any) -> Any:
+    return format_number(value) if value is None or isinstance(value, float) else value
+
+
+def markdown_table(frame: pd.DataFrame) -> str:
+    """Return a table as Markdown, its numbers readable; terms of a column `term` are quoted as code."""
+    quoted = readable(frame).map(lambda value: markdown(str(value)))
+    if "term" in quoted:
+        # What stands between backticks is shown as it is, but for the end of a cell.
+        quoted["term"] = ["`" + str(term).replace("|", "\\|") + "`" for term in frame["term"]]
+    quoted.columns = pd.Index([markdown(str(name)) for name in quoted.columns])
+    return str(quoted.to_markdown(index=False, disable_numparse=True))
+
+
+def markdown_list(texts: Iterable[str]) -> list[str]:
+    """Return texts as the lines of a Markdown list."""
+    return [f"- {markdown(text)}" for text in texts]
 
 
 def _latex(texts: pd.DataFrame) -> str:

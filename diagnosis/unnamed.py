@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from latticebench.diagnosis import rules
-from latticebench.diagnosis.acting import Chain, Force, Placed, Scene
+from latticebench.diagnosis.acting import AtOneSite, Chain, Force, Placed, Scene
 from latticebench.diagnosis.acting.everywhere import Everywhere
 from latticebench.diagnosis.acting.harmonic import wave
 from latticebench.diagnosis.fitting import Fitted
@@ -55,10 +55,9 @@ class Left:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LocalForce(Placed):
+class LocalForce(AtOneSite):
     """A force at one site that swings at one frequency."""
 
-    here: int
     omega: float
 
     @classmethod
@@ -68,11 +67,6 @@ class LocalForce(Placed):
         for here in scene.chain.moving:
             for omega in scene.frequencies[::stride]:
                 yield cls(effect=effect, here=here, omega=float(omega), strength=(0.0,) * (2 * scene.chain.parts))
-
-    @property
-    def site(self) -> int:
-        """The site, from 0."""
-        return self.here
 
     def labels(self, chain: Chain) -> tuple[str, ...]:
         """Return cosine and sine."""

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from latticebench.bench.provenance import lines
-from latticebench.bench.publish import format_number
+from latticebench.bench.publish import format_number, markdown_list, readable
 from latticebench.systems.files import write_text
 
 TABLES = ("measured",)
@@ -54,7 +54,7 @@ def publish(
     if not only:
         return []
     ordered = sorted(results, key=lambda result: str(result["case"]["name"]))
-    head = [f"- {line}" for line in lines(about)]
+    head = markdown_list(lines(about))
     text = ["# Measured recordings", "", *head, "", *(line for result in ordered for line in _recording(result))]
     path = folder / "measured.md"
     write_text(path, "\n".join(text))
@@ -91,11 +91,7 @@ def show(results: Iterable[Mapping[str, Any]], value: str = "") -> None:  # noqa
     from latticebench.bench.report.screen import show_rows
 
     frame = table(results).drop(columns=["file", "terms"])
-    readable = [
-        ["" if entry is None else format_number(entry) if isinstance(entry, float) else entry for entry in row]
-        for row in frame.to_numpy()
-    ]
-    show_rows(list(frame.columns), readable)
+    show_rows(list(frame.columns), readable(frame).to_numpy().tolist())
 
 
 def _recording(result: Mapping[str, Any]) -> list[str]:

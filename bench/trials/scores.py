@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.figures import save
 from latticebench.bench.provenance import lines
-from latticebench.bench.publish import format_number
+from latticebench.bench.publish import markdown_list, markdown_table, readable, render
 from latticebench.bench.trials.faults import BLIND, FIFTH_BLIND, FOURTH_BLIND, NONE, OTHERS, SECOND_BLIND, THIRD_BLIND
 from latticebench.bench.trials.trial import is_right
-from latticebench.systems.files import whole, write_text
+from latticebench.systems.files import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -149,18 +150,17 @@ def publish(
     """
     frame = table(results)
     frames = {"trials": frame, "summary": summary(frame), "effects": by_effect(frame)}
-    head = "".join(f"# {line}\n" for line in lines(about))
     written = []
     for name in only:
         path = folder / f"{name}.csv"
-        write_text(path, head + frames[name].to_csv(index=False))
+        write_text(path, render(frames[name], about, "csv"))
         written.append(path)
     if "summary" in only:
         path = folder / "summary.md"
         parts = [
-            "# Diagnoses", "", *(f"- {line}" for line in lines(about)), "",
-            "How often the diagnosis was right; errors are medians.", "", _markdown(frames["summary"]), "",
-            "By effect:", "", _markdown(frames["effects"]), "", "![what was named](confusion.png)", "",
+            "# Diagnoses", "", *markdown_list(lines(about)), "",
+            "How often the diagnosis was right; errors are medians.", "", markdown_table(frames["summary"]), "",
+            "By effect:", "", markdown_table(frames["effects"]), "", "![what was named](confusion.png)", "",
         ]  # fmt: skip
         write_text(path, "\n".join(parts))
         written += [path, *_save(frame, about, folder)]
@@ -181,11 +181,7 @@ def draw_all(
 def _save(frame: pd.DataFrame, about: Mapping[str, Any], folder: Path) -> list[Path]:
     if not (frame["status"] == "ok").any():
         return []
-    path = folder / "confusion.png"
-    with whole(path) as temporary:
-        about_it = {"Description": "\n".join(lines(about)), "Software": "latticebench"}
-        confusion(frame).savefig(temporary, format="png", dpi=110, metadata=about_it)
-    return [path]
+    return [save(confusion(frame), folder / "confusion.png", about)]
 
 
 def show(results: Iterable[Mapping[str, Any]], value: str = "") -> None:  # noqa: ARG001
@@ -194,19 +190,7 @@ def show(results: Iterable[Mapping[str, Any]], value: str = "") -> None:  # noqa
 
     frame = table(results)
     short = summary(frame)
-    show_rows(list(short.columns), _readable(short).to_numpy().tolist())
+    show_rows(list(short.columns), readable(short).astype(str).to_numpy().tolist())
     for _, row in frame[~frame["status"].isin(["ok", "skipped"])].iterrows():
         line = f"{row['status']}: {row['system']} {row['effect']} z={row['z']:g} seed {row['seed']}: {row['message']}"
         console().print(line, style="red", highlight=False, markup=False)
-
-
-def _markdown(frame: pd.DataFrame) -> str:
-    return str(_readable(frame).to_markdown(index=False, disable_numparse=True))
-
-
-def _readable(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of texts, its numbers with two digits."""
-    shown = frame.copy()
-    for name in shown.columns:
-        shown[name] = [format_number(value) if isinstance(value, float) else value for value in shown[name]]
-    return shown.astype(str)

@@ -3,10 +3,23 @@
 import importlib
 import pkgutil
 
-from latticebench.diagnosis.acting.placed import WAYS, Chain, Force, Misreading, Placed, Scene, Summand, way_of
+from latticebench.diagnosis.acting.placed import (
+    WAYS,
+    AtOneSite,
+    Chain,
+    Force,
+    Misreading,
+    OfSensors,
+    Placed,
+    Scene,
+    Summand,
+    way_of,
+)
 
 # Every file of this folder makes its way of acting known.
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
-__all__ = ["WAYS", "Chain", "Force", "Misreading", "Placed", "Scene", "Summand", "way_of"]
+__all__ = [
+    "WAYS", "AtOneSite", "Chain", "Force", "Misreading", "OfSensors", "Placed", "Scene", "Summand", "way_of",
+]  # fmt: skip

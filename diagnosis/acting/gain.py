@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, Placed, Scene
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, OfSensors, Placed, Scene
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
@@ -16,18 +16,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Gain(Placed, acts="gain"):
+class Gain(OfSensors, acts="gain"):
     """The reading is (1 + strength) u, with a strength for each of some sites.
 
     Attributes:
-        sites: those that read wrongly, from 0.
         both: whether velocities are read so, too.
     """
 
-    sites: tuple[int, ...]
     both: bool
-    instrument: ClassVar[bool] = True
-    local: ClassVar[bool] = True
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
@@ -41,11 +37,6 @@ class Gain(Placed, acts="gain"):
             single = [(site,) for site in chain.moving] if chain.sites > 1 or chain.levels > 1 else []
             for sites in [*single, *([others] if len(others) > 1 else [])]:
                 yield cls(effect=effect, sites=sites, both=both, strength=(0.0,) * len(sites))
-
-    @property
-    def site(self) -> int | None:
-        """The site, where it is one."""
-        return self.sites[0] if len(self.sites) == 1 else None
 
     @property
     def place(self) -> tuple[object, ...]:

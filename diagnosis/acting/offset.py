@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, Placed, Scene
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, OfSensors, Placed, Scene
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
@@ -16,20 +16,16 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Offset(Placed, acts="offset"):
+class Offset(OfSensors, acts="offset"):
     """The reading is u + b, with a b for each of some sites.
 
     Attributes:
-        sites: those that are off, from 0.
         parts: 1, or 2 for a complex field.
         every: whether these are all sites that have an equation.
     """
 
-    sites: tuple[int, ...]
     parts: int
     every: bool
-    instrument: ClassVar[bool] = True
-    local: ClassVar[bool] = True
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
@@ -42,16 +38,6 @@ class Offset(Placed, acts="offset"):
             yield cls(
                 effect=effect, sites=sites, parts=chain.parts, every=every, strength=(0.0,) * (len(sites) * chain.parts)
             )
-
-    @property
-    def site(self) -> int | None:
-        """The site, where it is one."""
-        return self.sites[0] if len(self.sites) == 1 else None
-
-    @property
-    def place(self) -> tuple[object, ...]:
-        """The effect and the sites."""
-        return (self.effect.name, self.sites)
 
     @property
     def from_the_start(self) -> bool:

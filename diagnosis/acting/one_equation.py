@@ -6,20 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Placed, Scene
+from latticebench.diagnosis.acting.placed import DIGITS, AtOneSite, Chain, Placed, Scene
 from latticebench.systems.effects import Effect
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class OneEquation(Placed, acts="one equation"):
-    """The whole right-hand side of one site is multiplied by 1 + strength.
+class OneEquation(AtOneSite, acts="one equation"):
+    """The whole right-hand side of one site is multiplied by 1 + strength."""
 
-    Attributes:
-        here: the site, from 0.
-    """
-
-    here: int
-    local: ClassVar[bool] = True
     separated_by: ClassVar[str] = (
         "waves of other lengths: another mass answers all forces of its site differently, a defect only the one on the "
         "site itself"
@@ -31,16 +25,6 @@ class OneEquation(Placed, acts="one equation"):
         if effect.texts(scene.chain.order, scene.chain.is_complex) and scene.chain.sites > 1:
             for site in scene.chain.moving:
                 yield cls(effect=effect, here=site, strength=(0.0,))
-
-    @property
-    def site(self) -> int:
-        """The site, from 0."""
-        return self.here
-
-    @property
-    def place(self) -> tuple[object, ...]:
-        """The effect and its site."""
-        return (self.effect.name, self.here)
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the name of the factor's excess over 1."""

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import Chain, Force, Placed, Scene, times
+from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Force, Placed, Scene, times
 from latticebench.systems.effects import Effect
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class OneSite(Placed, acts="one site"):
+class OneSite(AtOneSite, acts="one site"):
     """A term at one site: strength * text there, nothing elsewhere.
 
     Attributes:
         texts: T, or T and i*T for a complex coefficient.
-        here: the site, from 0.
     """
 
     texts: tuple[str, ...]
-    here: int
-    local: ClassVar[bool] = True
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
@@ -31,16 +27,6 @@ class OneSite(Placed, acts="one site"):
         texts = scene.terms(effect)
         for site in scene.chain.moving if texts and scene.chain.sites > 1 else ():
             yield cls(effect=effect, texts=texts, here=site, strength=(0.0,) * len(texts))
-
-    @property
-    def site(self) -> int:
-        """The site, from 0."""
-        return self.here
-
-    @property
-    def place(self) -> tuple[object, ...]:
-        """The effect and its site."""
-        return (self.effect.name, self.here)
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the terms."""

@@ -293,6 +293,51 @@ class Placed(ABC):
         return []
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AtOneSite(Placed):
+    """What acts at a single site.
+
+    Attributes:
+        here: the site, from 0.
+    """
+
+    here: int
+    local: ClassVar[bool] = True
+
+    @property
+    def site(self) -> int:
+        """The site, from 0."""
+        return self.here
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect and its site."""
+        return (self.effect.name, self.here)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OfSensors(Placed):
+    """What some sensors do to their readings.
+
+    Attributes:
+        sites: those of the sensors, from 0.
+    """
+
+    sites: tuple[int, ...]
+    instrument: ClassVar[bool] = True
+    local: ClassVar[bool] = True
+
+    @property
+    def site(self) -> int | None:
+        """The site, where it is one."""
+        return self.sites[0] if len(self.sites) == 1 else None
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect and the sites."""
+        return (self.effect.name, self.sites)
+
+
 def times(value: float, text: str) -> str:
     """Return a coefficient times a term as text."""
     return f"{value:.{DIGITS}g}" if text == "1" else f"{value:.{DIGITS}g}*{text}"

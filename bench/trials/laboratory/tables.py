@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.figures import save
 from latticebench.bench.provenance import lines
-from latticebench.bench.publish import format_number
+from latticebench.bench.publish import markdown_list, markdown_table, readable, render
 from latticebench.bench.trials.laboratory.judging import WORSE, found_in, judge, matched, written
-from latticebench.systems.files import whole, write_text
+from latticebench.systems.files import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -197,21 +198,20 @@ def publish(
     kept = list(results)
     frame = table(kept)
     frames = {"laboratory": frame, "summary": summary(frame), "effects": by_effect(kept)}
-    head = "".join(f"# {line}\n" for line in lines(about))
     written = []
     for name in only:
         path = folder / f"{name}.csv"
-        write_text(path, head + frames[name].to_csv(index=False))
+        write_text(path, render(frames[name], about, "csv"))
         written.append(path)
     if "summary" in only:
         path = folder / "summary.md"
         parts = [
-            "# Laboratory recordings", "", *(f"- {line}" for line in lines(about)), "",
+            "# Laboratory recordings", "", *markdown_list(lines(about)), "",
             "Shares in per cent with 95 % intervals (Wilson). Right: every effect named, alone or in its group, and "
             "nothing invented; no answer is wrong. Alike counted: an effect that does the same in these readings "
             "counts as the effect. Residuals are in units of the noise that was added.", "",
-            _markdown(frames["summary"]), "", "Nothing missing:", "", _markdown(nothing_missing(frame)), "",
-            "Named, by effect and its size z:", "", _markdown(frames["effects"]), "",
+            markdown_table(frames["summary"]), "", "Nothing missing:", "", markdown_table(nothing_missing(frame)), "",
+            "Named, by effect and its size z:", "", markdown_table(frames["effects"]), "",
             "![what was named](confusion.png)", "",
         ]  # fmt: skip
         write_text(path, "\n".join(parts))
@@ -233,11 +233,7 @@ def draw_all(
 def _save(results: Sequence[Mapping[str, Any]], about: Mapping[str, Any], folder: Path) -> list[Path]:
     if not any(result["status"] == "ok" for result in results):
         return []
-    path = folder / "confusion.png"
-    with whole(path) as temporary:
-        about_it = {"Description": "\n".join(lines(about)), "Software": "latticebench"}
-        confusion(results).savefig(temporary, format="png", dpi=110, metadata=about_it)
-    return [path]
+    return [save(confusion(results), folder / "confusion.png", about)]
 
 
 def show(results: Iterable[Mapping[str, Any]], value: str = "") -> None:  # noqa: ARG001
@@ -246,19 +242,7 @@ def show(results: Iterable[Mapping[str, Any]], value: str = "") -> None:  # noqa
 
     frame = table(results)
     for short in (summary(frame), nothing_missing(frame)):
-        show_rows(list(short.columns), _readable(short).to_numpy().tolist())
+        show_rows(list(short.columns), readable(short).astype(str).to_numpy().tolist())
     for _, row in frame[frame["status"].isin(LOST)].iterrows():
         line = f"{row['status']}: {row['instrument']} seed {row['seed']}: {row['message']}"
         console().print(line, style="red", highlight=False, markup=False)
-
-
-def _markdown(frame: pd.DataFrame) -> str:
-    return str(_readable(frame).to_markdown(index=False, disable_numparse=True))
-
-
-def _readable(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of texts, its numbers with two digits."""
-    shown = frame.copy()
-    for name in shown.columns:
-        shown[name] = [format_number(value) if isinstance(value, float) else value for value in shown[name]]
-    return shown.astype(str)
