@@ -99,7 +99,8 @@ def _exchanged(search: Search, fitted: Fitted, number: int) -> _Exchange:
     for found in _rivals(search, fitted, without, number, evidence):
         models.append(found)
         name = found.model.effects[-1].effect.name
-        if found.cost < fitted.cost + rules.EQUAL and name != placed.effect.name:
+        more = len(found.model.numbers) - len(fitted.model.numbers)
+        if found.cost + more < fitted.cost + rules.EQUAL and name != placed.effect.name:
             equal.append(name)
     return _Exchange(float(evidence), tuple(models), tuple(dict.fromkeys(equal)))
 

@@ -206,7 +206,8 @@ class Fitted:
             level[flat] = self.followed.level[part][valid].reshape(-1, *shape[1:])
             seen[flat] = self.followed.left[part][valid].reshape(-1, *shape[1:]) + level[flat]
             level[..., self.layout.plain.border] = np.nan
-            field[flat] = fields(self.layout, number, self.followed.nodes[number])[1][valid]
+            nodes, splines = self.followed.nodes[number], self.followed.splines[number]
+            field[flat] = fields(self.layout, number, nodes, splines)[1][valid]
             found.append(Curve(record.times, seen, level, field))
         return found
 
@@ -220,6 +221,7 @@ def fit(
     noise: Noise | None = None,
     steps: int = 20,
     hope: float = np.inf,
+    splines: Sequence[ndarray | None] | None = None,
 ) -> Fitted | None:
     """Fit a model to pieces; None where it cannot be followed or there is no hope for it.
 
@@ -230,14 +232,15 @@ def fit(
         structure: of the noise; chosen by the readings if None.
         noise: to start from.
         steps: largest number of Gauss-Newton steps.
+        splines: of the curves of the sites without an equation, to start from.
         hope: a cost; the fit is given up where the next step promises less than half of the way there.
     """
-    path = follow(model, layout, near)
+    path = follow(model, layout, near, splines=splines)
     followed = None if path is None else linearised(path, layout)
     if followed is None:
         return None
     rows = layout.laid_out()
-    free = float(len(model.numbers) + layout.pieces * followed.size)
+    free = _taken(followed, layout, rows)
     noise, cost = _likely(followed, rows, free, structure, noise)
     damping, converged = DAMPING, False
     for step in range(steps):
@@ -254,7 +257,7 @@ def fit(
     if cost > hope:
         return None
     _, error, slope, _ = whitened(followed, noise, rows)
-    covariance = normal(layout, error, slope, followed.size, 0.0).covariance()
+    covariance = normal(layout, error, slope, followed.local, 0.0).covariance()
     return Fitted(layout, followed, noise, cost, covariance, converged, rows)
 
 
@@ -271,8 +274,17 @@ def gain(won: float, error: ndarray, count: float) -> float:
     return float(-0.5 * count * np.log1p(-taken / max(total, 1e-12 * count))) if taken > 0 else 0.0
 
 
+def _taken(followed: Followed, layout: Layout, rows: Rows) -> Float[ndarray, " sensors"]:
+    """Return how many numbers a fit took from the readings of each sensor."""
+    sensors = int(np.max(rows.sensor)) + 1
+    outer = np.isin(np.arange(sensors) % layout.chain.sites, layout.plain.border)
+    inner = len(followed.model.numbers) + layout.pieces * followed.size
+    curves = layout.pieces * (followed.local - followed.size)
+    return np.where(outer, curves / max(int(np.sum(outer)), 1), inner / max(int(np.sum(~outer)), 1))
+
+
 def _likely(
-    followed: Path, rows: Rows, free: float, structure: Structure | None, start: Noise | None
+    followed: Path, rows: Rows, free: ndarray, structure: Structure | None, start: Noise | None
 ) -> tuple[Noise, float]:
     """Return the noise that makes what is left most likely, and the cost."""
     noise = estimate(followed.left, followed.level, rows, free=free, structure=structure, start=start)
@@ -284,7 +296,7 @@ def _stepped(
 ) -> tuple[Followed, float, float] | None:
     """Return where a step leads, the damping of the next and the nats won; None where none promises enough."""
     _, error, slope, _ = whitened(followed, noise, rows)
-    before, size = -noise.log_likelihood(followed.left, followed.level, rows), followed.size
+    before, size = -noise.log_likelihood(followed.left, followed.level, rows), followed.local
     for _ in range(MOST_FAILURES):
         problem = normal(layout, error, slope, size, damping)
         change = problem.step(damping)
@@ -293,12 +305,14 @@ def _stepped(
         promised = problem.promised(change)
         if promised < ENOUGH / 2 or gain(2 * promised, error, float(np.sum(np.isfinite(followed.left)))) < least:
             return None
-        near = []
-        for y, moves, inner in zip(followed.nodes, followed.moves, problem.inner, strict=True):
+        near, splines = [], []
+        for number, (y, moves, inner) in enumerate(zip(followed.nodes, followed.moves, problem.inner, strict=True)):
             local = inner[:, :, -1] - inner[:, :, :-1] @ change
+            splines.append(layout.bordered(number, followed.splines[number], local[:, y.shape[-1] :]))
             varied = np.concatenate([local, np.broadcast_to(change, (len(local), len(change)))], axis=1)
             near.append(y + (varied[:, None, None] @ moves)[:, :, 0])
-        trial = follow(followed.model.moved(followed.model.numbers + change), layout, near, followed.transitions)
+        model = followed.model.moved(followed.model.numbers + change)
+        trial = follow(model, layout, near, followed.transitions, splines)
         if trial is not None:
             won = before + noise.log_likelihood(trial.left, trial.level, rows)
             further = linearised(trial, layout) if won > -1e-6 else None

@@ -75,7 +75,8 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
         model = _foreseeable(fitted.model, [one.t[round(len(one.t) * share)] for one in problem.data])
     early = other.first(share)
     layout = Layout.of(early, max(len(one.t) for one in early.data), None, fitted.layout.small)
-    if not held_out and fitted.longest < max(len(one.t) for one in problem.data):
+    shorter = not held_out or len(other.plain.border)
+    if shorter and fitted.longest < max(len(one.t) for one in problem.data):
         layout = Layout.of(early, fitted.longest, None, fitted.layout.small)
     near = [nodes[rows] for nodes, rows in zip(early.nodes, layout.rows, strict=True)]
     if not held_out:
@@ -134,11 +135,10 @@ def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Predi
             found.append(state)
             past.learn(float(end), state)
         whole = problem.plain.whole(np.stack(found), record.stretches.driven(late, problem.splines[number]))
-        field, rate = whole[:, : problem.chain.levels], np.zeros_like(whole)
-        rate[:, :-1] = whole[:, 1:]
+        field = whole[:, : problem.chain.levels]
         predicted = field[:, 0].copy()
         for placed, _ in model.instruments():
-            predicted += placed.misread(late, field, rate[:, : problem.chain.levels]).added[:, 0]
+            predicted += placed.misread(late, field).added[:, 0]
         seen = split_parts(samples.u[cut : cut + MOST_ROWS], samples.is_complex)
         seen[..., problem.plain.border] = np.nan
         forecast = Prediction(late, seen, predicted, 0.0)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from latticebench.diagnosis.acting import Chain
+from latticebench.diagnosis.border import Border, borders
 from latticebench.diagnosis.model import Assembled, Model
 from latticebench.diagnosis.noise import Rows
 from latticebench.diagnosis.problem import Problem
@@ -55,7 +56,8 @@ class Layout:
         chain: the lattice.
         plain: the declared terms on it.
         records: the recordings.
-        splines: of the sites without an equation, of each recording.
+        splines: of smoothed readings of the sites without an equation, of each recording.
+        borders: the curves that these sites follow on the pieces, of each recording.
         rows: which rows of its recording each piece has (pieces, m); the last is repeated where a piece is shorter.
         valid: whether a row is none of those repeated.
         substeps: of the integrator, for each interval (pieces * (m - 1)).
@@ -68,6 +70,7 @@ class Layout:
     plain: Dynamics
     records: tuple[Record, ...]
     splines: tuple[ndarray | None, ...]
+    borders: tuple[Border | None, ...]
     rows: tuple[Int[ndarray, "pieces m"], ...]
     valid: tuple[Bool[ndarray, "pieces m"], ...]
     substeps: tuple[Int[ndarray, " intervals"], ...]
@@ -89,9 +92,11 @@ class Layout:
             found_rows.append(np.stack([np.minimum(begin + np.arange(m), end - 1) for begin, end in pieces]))
             found_valid.append(np.stack([begin + np.arange(m) < end for begin, end in pieces]))
         substeps = tuple(np.ones(rows.shape[0] * (rows.shape[1] - 1), dtype=int) for rows in found_rows)
+        curves = borders(problem.records, problem.plain, problem.splines, found_rows, found_valid)
         return cls(
-            problem.chain, problem.plain, problem.records, problem.splines, tuple(found_rows), tuple(found_valid),
-            substeps, small, least=ROUNDING * min((one for one in problem.steps if one > 0), default=0.0),
+            problem.chain, problem.plain, problem.records, problem.splines, curves, tuple(found_rows),
+            tuple(found_valid), substeps, small,
+            least=ROUNDING * min((one for one in problem.steps if one > 0), default=0.0),
         )  # fmt: skip
 
     @property
@@ -119,17 +124,35 @@ class Layout:
 
     def stretches(self, number: int, assembled: Assembled) -> Stretches:
         """Return the intervals of all pieces of one recording."""
-        record = self.records[number]
+        record, border = self.records[number], self.borders[number]
         t = record.times[self.rows[number]]
-        ends = t[:, :-1].ravel(), t[:, 1:].ravel()
         return replace(
             record.stretches,
             dynamics=assembled.dynamics,
-            begin=ends[0],
-            end=ends[1],
+            begin=t[:, :-1].ravel(),
+            end=t[:, 1:].ravel(),
+            drive=None if border is None else border.basis,
             held=True,
             integrator=self.integrator,
         )
+
+    @property
+    def curves(self) -> tuple[ndarray | None, ...]:
+        """Coefficients of the curves through what was read of the sites without an equation."""
+        return tuple(None if one is None else one.start for one in self.borders)
+
+    def bordered(self, number: int, splines: ndarray | None, by: Float[ndarray, "pieces numbers"]) -> ndarray | None:
+        """Return coefficients of the border's curves that are changed by the numbers of each piece."""
+        border = self.borders[number]
+        return None if border is None or splines is None else border.moved(splines, by)
+
+    def driven(self, number: int, splines: ndarray | None) -> ndarray | None:
+        """Return what the sites without an equation do at all rows: (rows, order, parts, border)."""
+        border, record = self.borders[number], self.records[number]
+        if border is None:
+            return None
+        t = record.times[self.rows[number]].ravel()
+        return replace(record.stretches, drive=border.basis).driven(t, splines)
 
     def rounds(self, number: int) -> Int[ndarray, " intervals"]:
         """Return steps for each interval of a recording: as many for all as for one where that is quicker.
@@ -158,7 +181,7 @@ class Layout:
             tolerance = np.repeat(levels, assembled.dynamics.parts * assembled.dynamics.count)
             flat = y[:, :-1].reshape(-1, y.shape[-1])
             stretches = self.stretches(number, assembled)
-            needed = stretches.substeps(assembled.coefficients, flat, tolerance, self.splines[number])
+            needed = stretches.substeps(assembled.coefficients, flat, tolerance, self.curves[number])
             lasting = np.ceil((stretches.end - stretches.begin) / float(np.median(np.diff(self.records[number].times))))
             found.append(np.minimum(needed, MOST_SUBSTEPS * np.maximum(lasting, 1).astype(int)))
         return tuple(found)
@@ -181,6 +204,7 @@ class Path:
     Attributes:
         model: with its numbers.
         nodes: states at the rows of each recording's pieces (pieces, m, S).
+        splines: coefficients of the curves of the sites without an equation.
         level: the model's readings, rows of all recordings one after another (rows, channels).
         left: readings less that, NaN where nothing was read.
         own: derivatives of the readings by the field (rows, channels).
@@ -188,6 +212,7 @@ class Path:
 
     model: Model
     nodes: tuple[Float[ndarray, "pieces m state"], ...]
+    splines: tuple[ndarray | None, ...]
     level: Float[ndarray, "rows channels"]
     left: Float[ndarray, "rows channels"]
     own: Float[ndarray, "rows channels"]
@@ -203,14 +228,20 @@ class Followed(Path):
     """A motion with its derivatives.
 
     Attributes:
-        moves: of the nodes, by the piece's initial state and the model's numbers (pieces, m, S + G, S).
+        moves: of the nodes, by the piece's own numbers, which are its initial state and the curves of its border, and
+            by the model's numbers (pieces, m, L + G, S).
         transitions: of each state by the one before (pieces, m - 1, S, S).
-        slope: of the readings, by the initial state and the numbers (rows, channels, S + G).
+        slope: of the readings, by the piece's own numbers and the model's (rows, channels, L + G).
     """
 
     moves: tuple[Float[ndarray, "pieces m varied state"], ...]
     transitions: tuple[Float[ndarray, "pieces intervals state state"], ...]
     slope: Float[ndarray, "rows channels varied"]
+
+    @property
+    def local(self) -> int:
+        """The number L of a piece's own numbers."""
+        return int(self.slope.shape[-1]) - len(self.model.numbers)
 
 
 def follow(
@@ -218,6 +249,7 @@ def follow(
     layout: Layout,
     near: Sequence[Float[ndarray, "pieces m state"]],
     transitions: Sequence[Float[ndarray, "pieces intervals state state"]] | None = None,
+    splines: Sequence[ndarray | None] | None = None,
 ) -> Path | None:
     """Follow a model from the first state of each piece; None where it cannot be followed.
 
@@ -226,18 +258,20 @@ def follow(
         layout: the pieces.
         near: states near the motion, of each recording.
         transitions: the derivatives of each state by the one before, of a motion nearby if there is one.
+        splines: of the curves of the sites without an equation; those through what was read of them if None.
     """
-    nodes = []
+    nodes: list[ndarray] = []
+    splines = layout.curves if splines is None else tuple(splines)
     with np.errstate(all="ignore"):
         for number in range(len(layout.records)):
             assembled = model.assembled(layout.plain, layout.chain, number)
-            gaps = _Gaps.of(layout, number, assembled)
+            gaps = _Gaps.of(layout, number, assembled, splines[number])
             closed = None if transitions is None else gaps.closed_along(near[number], transitions[number])
             closed = gaps.closed(near[number]) if closed is None else closed
             if closed is None:
                 return None
             nodes.append(closed)
-    return Path(model, tuple(nodes), *_readings(model, layout, nodes))
+    return Path(model, tuple(nodes), splines, *_readings(model, layout, nodes, splines))
 
 
 def linearised(path: Path, layout: Layout) -> Followed | None:
@@ -247,16 +281,19 @@ def linearised(path: Path, layout: Layout) -> Followed | None:
         for number, y in enumerate(path.nodes):
             assembled = path.model.assembled(layout.plain, layout.chain, number)
             flat = y[:, :-1].reshape(-1, y.shape[-1])
-            found = layout.stretches(number, assembled).vary(
-                assembled.coefficients, flat, layout.rounds(number), layout.splines[number], dense=True
+            stretches = replace(layout.stretches(number, assembled), held=False)
+            found = stretches.vary(
+                assembled.coefficients, flat, layout.rounds(number), path.splines[number], dense=True
             )
             by_state = np.asarray(found.by_state).reshape(*y[:, 1:].shape, y.shape[-1])
-            moves.append(_moves(found, by_state, assembled))
+            moves.append(_moves(found, by_state, assembled, layout.borders[number]))
             transitions.append(by_state)
     if not all(np.all(np.isfinite(one)) for one in moves):
         return None
     slope = _slopes(path, layout, moves)
-    return Followed(path.model, path.nodes, path.level, path.left, path.own, tuple(moves), tuple(transitions), slope)
+    return Followed(
+        path.model, path.nodes, path.splines, path.level, path.left, path.own, tuple(moves), tuple(transitions), slope
+    )
 
 
 def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "time state"]) -> ndarray:
@@ -275,11 +312,9 @@ def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "tim
     reading = layout.plain.whole(nodes, driven)
     field = reading.copy()
     for _ in range(UNREAD):
-        rate = np.zeros_like(field)
-        rate[:, :-1] = field[:, 1:]
         level, own = field[:, : chain.levels], np.ones_like(field[:, : chain.levels])
         for placed, _ in model.instruments():
-            wrong = placed.misread(t, field[:, : chain.levels], rate[:, : chain.levels])
+            wrong = placed.misread(t, field[:, : chain.levels])
             level, own = level + wrong.added, own + wrong.slope
         own = np.where(np.abs(own) > LEAST_SLOPE, own, 1.0)
         field[:, : chain.levels] += (reading[:, : chain.levels] - level) / own
@@ -297,22 +332,21 @@ class _Gaps:
     assembled: Assembled
     stretches: Stretches
     units: Float[ndarray, " state"]
+    splines: ndarray | None
 
     @classmethod
-    def of(cls, layout: Layout, number: int, assembled: Assembled) -> _Gaps:
+    def of(cls, layout: Layout, number: int, assembled: Assembled, splines: ndarray | None) -> _Gaps:
         dynamics, record = assembled.dynamics, layout.records[number]
         levels = [layout.small, layout.small / float(np.median(np.diff(record.times)))][: dynamics.order]
         units = np.repeat(levels, dynamics.parts * dynamics.count)
-        return cls(layout, number, assembled, layout.stretches(number, assembled), units)
+        return cls(layout, number, assembled, layout.stretches(number, assembled), units, splines)
 
     def closed_along(self, near: ndarray, by_state: ndarray) -> ndarray | None:
         """Return states that follow one another, by steps with given derivatives; None where these are too far off."""
         y, last = np.array(near), np.inf
         for _ in range(CLOSURES):
             start = y[:, :-1].reshape(-1, y.shape[-1])
-            ends = self.stretches.run(
-                self.assembled.coefficients, start, self.layout.rounds(self.number), self.layout.splines[self.number]
-            )
+            ends = self.stretches.run(self.assembled.coefficients, start, self.layout.rounds(self.number), self.splines)
             y, worst = self._moved(y, ends, by_state)
             if worst < CLOSED * CHORD:
                 return y
@@ -327,7 +361,7 @@ class _Gaps:
         for _ in range(CLOSURES):
             start = y[:, :-1].reshape(-1, y.shape[-1])
             found = self.stretches.vary(
-                self.assembled.coefficients, start, self.layout.rounds(self.number), self.layout.splines[self.number],
+                self.assembled.coefficients, start, self.layout.rounds(self.number), self.splines,
                 by_terms=False, dense=True,
             )  # fmt: skip
             y, worst = self._moved(y, found.end, np.asarray(found.by_state))
@@ -348,14 +382,16 @@ class _Gaps:
         return y + change, worst if np.isfinite(worst) else np.inf
 
 
-def _moves(transition: Transition, by_state: ndarray, assembled: Assembled) -> ndarray:
-    """Return the derivatives of all states by the initial one and by the model's numbers."""
+def _moves(transition: Transition, by_state: ndarray, assembled: Assembled, border: Border | None) -> ndarray:
+    """Return the derivatives of all states by the initial one, the border's curves and the model's numbers."""
     pieces, intervals, size, _ = by_state.shape
     forced = np.tensordot(transition.by_coefficient, assembled.slope, (1, 0))
-    count = forced.shape[2]
-    wide = np.zeros((pieces, intervals, size + count, size))
-    wide[:, :, size:] = np.moveaxis(forced, 1, 2).reshape(pieces, intervals, count, size)
-    first = np.zeros((pieces, size + count, size))
+    pushed = [np.moveaxis(forced, 1, 2).reshape(pieces, intervals, -1, size)]
+    if border is not None:
+        pushed.insert(0, border.driving(transition, intervals))
+    pushed.insert(0, np.zeros((pieces, intervals, size, size)))
+    wide = np.concatenate(pushed, axis=2)
+    first = np.zeros((pieces, wide.shape[2], size))
     first[:, :size] = np.eye(size)
     return propagate(by_state, wide, first)
 
@@ -402,26 +438,25 @@ def _in_blocks(by_state: ndarray, forced: ndarray, first: ndarray) -> ndarray:
     return np.asarray(np.concatenate([inner, z[:, -1:, -1]], axis=1)[:, : intervals + 1])
 
 
-def fields(layout: Layout, number: int, nodes: Float[ndarray, "pieces m state"]) -> tuple[ndarray, ndarray, ndarray]:
-    """Return times (rows,), the field (rows, order, parts, N), and its time derivative as far as the state tells it."""
-    record = layout.records[number]
-    t = record.times[layout.rows[number]].ravel()
-    driven = record.stretches.driven(t, layout.splines[number])
-    field = layout.plain.whole(nodes.reshape(t.size, -1), driven)
-    rate = np.zeros_like(field)
-    rate[:, :-1] = field[:, 1:]
-    return t, field, rate
+def fields(
+    layout: Layout, number: int, nodes: Float[ndarray, "pieces m state"], splines: ndarray | None
+) -> tuple[ndarray, ndarray]:
+    """Return times (rows,) and the field (rows, order, parts, N)."""
+    t = layout.records[number].times[layout.rows[number]].ravel()
+    return t, layout.plain.whole(nodes.reshape(t.size, -1), layout.driven(number, splines))
 
 
-def _readings(model: Model, layout: Layout, nodes: Sequence[ndarray]) -> tuple[ndarray, ndarray, ndarray]:
+def _readings(
+    model: Model, layout: Layout, nodes: Sequence[ndarray], splines: Sequence[ndarray | None]
+) -> tuple[ndarray, ndarray, ndarray]:
     """Return what instruments make of a motion, what that leaves of the readings, and its derivative by the field."""
     levels, lefts, owns = [], [], []
     for number, record in enumerate(layout.records):
         rows = layout.rows[number]
-        t, field, rate = _seen(layout, number, nodes[number])
+        t, field = _seen(layout, number, nodes[number], splines[number])
         level, own = field, np.ones_like(field)
         for placed, _ in model.instruments():
-            wrong = placed.misread(t, field, rate)
+            wrong = placed.misread(t, field)
             level, own = level + wrong.added, own + wrong.slope
         seen = record.seen[rows] & layout.valid[number][..., None, None, None]
         value = np.where(seen, record.value[rows], np.nan).reshape(level.shape)
@@ -436,19 +471,24 @@ def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
     """Return the derivatives of the readings by the initial state and the model's numbers."""
     found, begin = [], 0
     for number, rows in enumerate(layout.rows):
-        t, field, rate = _seen(layout, number, path.nodes[number])
+        t, field = _seen(layout, number, path.nodes[number], path.splines[number])
         count, size = moves[number].shape[2:]
         flat = moves[number].reshape(rows.size, count, size)
         by = np.moveaxis(layout.plain.whole(flat, None)[:, :, : layout.chain.levels], 1, -1)
+        border = layout.borders[number]
+        if border is not None:
+            t = layout.records[number].times[rows]
+            border.add_readings(by[..., size : size + border.size], t, layout.plain.border)
         by = by.reshape(rows.size, -1, count) * path.own[begin : begin + rows.size, :, None]
         begin += rows.size
         for placed, block in path.model.instruments():
-            wrong = np.moveaxis(placed.misread(t, field, rate).by, 0, -1)
-            by[..., size + block.start : size + block.stop] += wrong.reshape(rows.size, by.shape[1], -1)
+            wrong = np.moveaxis(placed.misread(t, field).by, 0, -1)
+            own = count - len(path.model.numbers)
+            by[..., own + block.start : own + block.stop] += wrong.reshape(rows.size, by.shape[1], -1)
         found.append(by)
     return np.concatenate(found)
 
 
-def _seen(layout: Layout, number: int, nodes: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    t, field, rate = fields(layout, number, nodes)
-    return t, field[:, : layout.chain.levels], rate[:, : layout.chain.levels]
+def _seen(layout: Layout, number: int, nodes: ndarray, splines: ndarray | None) -> tuple[ndarray, ndarray]:
+    t, field = fields(layout, number, nodes, splines)
+    return t, field[:, : layout.chain.levels]

@@ -47,6 +47,8 @@ MARGIN = 2.0
 # Readings that the structure is chosen from, in stretches all over a longer record: what so many do not show changes
 # sizes by less than a per cent.
 GLANCE, STRETCHES = 20_000, 10
+# Of a sensor's readings a fit leaves at least this share free.
+SPARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,8 +246,8 @@ def _by_tail(z: Float[ndarray, " readings"], tail: float) -> float:
 
 
 def estimate(
-    left: Readings, level: Readings, rows: Rows, *, free: float = 0.0, structure: Structure | None = None,
-    start: Noise | None = None,
+    left: Readings, level: Readings, rows: Rows, *, free: Float[ndarray, " sensors"] | float = 0.0,
+    structure: Structure | None = None, start: Noise | None = None,
 ) -> Noise:  # fmt: skip
     """Return the noise under which residuals are most likely.
 
@@ -253,8 +255,8 @@ def estimate(
         left: readings less what a model says, NaN where nothing was read.
         level: what the model says, in the same units.
         rows: times and sensors of both.
-        free: how many numbers the fit of the model took from the n readings. Such a fit leaves residuals that are too
-            small: sizes are multiplied by sqrt(n / (n - free)).
+        free: how many numbers the fit of the model took from the n readings, of each sensor or of all together. Such a
+            fit leaves residuals that are too small: sizes are multiplied by sqrt(n / (n - free)).
         structure: which parts to use; chosen by Schwarz' criterion if left out.
         start: where to start, such as the noise at the last step of an iteration.
     """
@@ -263,8 +265,13 @@ def estimate(
         start = _chosen(_Task.of(*_glance(left, level, rows)))
         structure = start.structure
     found = task.best(structure, start)[0]
-    scale = float(np.sqrt(len(task.value) / max(len(task.value) - free, 1.0))) if len(task.value) else 1.0
-    return replace(found, size=found.size * scale, growth=found.growth * scale)
+    everything, taken = len(task.value), float(np.sum(free))
+    scale = float(np.sqrt(everything / max(everything - taken, 1.0))) if everything else 1.0
+    own = np.full(task.sensors, scale)
+    if np.ndim(free) and found.structure.own_sizes:
+        count = np.bincount(task.sensor, minlength=task.sensors)
+        own = np.sqrt(np.maximum(count, 1) / np.maximum(count - free, SPARE * np.maximum(count, 1)))
+    return replace(found, size=found.size * own, growth=found.growth * scale)
 
 
 def _glance(left: ndarray, level: ndarray, rows: Rows) -> tuple[ndarray, ndarray, Rows]:

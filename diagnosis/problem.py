@@ -300,7 +300,6 @@ def _record(samples: Samples, plain: Dynamics, states: tuple[ndarray, ndarray | 
     fields = [samples.u] if plain.order == 1 or samples.v is None else [samples.u, samples.v]
     value = np.stack([split_parts(one, samples.is_complex) for one in fields], axis=1)
     seen = np.isfinite(value)
-    seen[..., plain.border] = False
     drive, splines = None, None
     if len(plain.border):
         from scipy.interpolate import make_interp_spline

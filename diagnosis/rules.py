@@ -27,7 +27,8 @@ TRIED = 4
 UNDERSTATED = 2.0
 # Effects in a model, at most.
 MOST_EFFECTS = 8
-# Effects that come within so many nats of the one that is named cannot be told from it by these readings.
+# Effects that come within so many nats of the one that is named, a nat for each number more, cannot be told from it by
+# these readings.
 EQUAL = 3.0
 # Influences with a frequency or a time of their own are looked for on horizons of so many periods of the main
 # frequency: on shorter ones they stand in for whatever is missing.
@@ -37,9 +38,9 @@ FIRST_HORIZON = 0.5
 # Pieces grow so many times from one horizon to the next, and faster where that changed nothing; beyond this share of
 # the record they are the record.
 GROWTH, FASTER, ALMOST = 2, 4, 0.6
-# Periods of the longest pieces where the ends are unknown: the outer sites are taken as read, so that their noise
-# drives their neighbours, the more the longer a piece is.
-BORDER = 1.0
+# Periods of the longest pieces where the ends are unknown: the curves of the outer sites have numbers of their own in
+# each, so that work grows as the square of a piece's length.
+BORDER = 16.0
 # A residual beyond so many times the noise that the readings themselves show is not followed.
 LOST = 3.0
 # Nats that a chain costs in which neighbours push each other away. In a linear chain of two it is the mirror image of

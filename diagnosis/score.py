@@ -61,7 +61,7 @@ class _Along:
     Attributes:
         t: times (rows,).
         states: (rows, S).
-        field, rate: as readings see them (rows, levels, parts, N).
+        field: as readings see it (rows, levels, parts, N).
         driven: the sites without an equation.
         assembled: the model.
         early, late: what a force does within an interval that falls from 1 to 0, or grows from 0 to 1 (pieces, m - 1,
@@ -71,7 +71,6 @@ class _Along:
     t: ndarray
     states: ndarray
     field: ndarray
-    rate: ndarray
     driven: ndarray | None
     assembled: Assembled
     early: ndarray
@@ -101,8 +100,8 @@ class Tangent:
         layout, followed = fitted.layout, fitted.followed
         self.whitener, self.error, slope, self.robust = whitened(followed, fitted.noise, fitted.rows)
         self.along = [self._along(number) for number in range(len(layout.records))]
-        self.solved = normal(layout, self.error, slope, followed.size, 0.0)
-        size, left, free = followed.size, [], []
+        self.solved = normal(layout, self.error, slope, followed.local, 0.0)
+        size, left, free = followed.local, [], []
         self.local, self.inverse = [], []
         for by, error, inner in zip(self.solved.slope, self.solved.error, self.solved.inner, strict=True):
             local = by[:, :, :size]
@@ -140,17 +139,17 @@ class Tangent:
         pieces, m, size = y.shape
         stretches = replace(layout.stretches(number, assembled), dynamics=wide)
         flat = y[:, :-1].reshape(-1, size)
-        found = stretches.vary(coefficients, flat, layout.rounds(number), layout.splines[number], dense=True)
+        found = stretches.vary(coefficients, flat, layout.rounds(number), followed.splines[number], dense=True)
         unit = found.by_coefficient[:, len(dynamics.terms) :]
         unit = unit.reshape(pieces, m - 1, chain.parts, 2, len(chain.moving), size)
         t = record.times[rows]
         h = np.diff(t, axis=1)[:, :, None, None, None]
         ramp = unit[:, :, :, 1] - t[:, :-1, None, None, None] * unit[:, :, :, 0]
         late = np.where(h > 0, ramp / np.where(h > 0, h, 1.0), 0.0)
-        times, field, rate = fields(layout, number, y)
-        driven = record.stretches.driven(times, layout.splines[number])
-        seen = field[:, : chain.levels], rate[:, : chain.levels]
-        return _Along(times, y.reshape(-1, size), *seen, driven, assembled, unit[:, :, :, 0] - late, late)
+        times, field = fields(layout, number, y, followed.splines[number])
+        driven = layout.driven(number, followed.splines[number])
+        seen = field[:, : chain.levels]
+        return _Along(times, y.reshape(-1, size), seen, driven, assembled, unit[:, :, :, 0] - late, late)
 
     def scored(self, candidates: Sequence[Placed]) -> list[Scored]:
         """Return all candidates with what they would win."""
@@ -367,7 +366,7 @@ class Tangent:
             blocks.append(field.reshape(rows.size, -1, z.shape[1]) * self._own(number)[..., None])
         for one in batch:
             if one.instrument:
-                by = one.misread(along.t, along.field, along.rate).by
+                by = one.misread(along.t, along.field).by
                 blocks.append(np.moveaxis(by.reshape(len(by), rows.size, -1), 0, -1))
         return np.concatenate(blocks, axis=-1)
 

@@ -288,9 +288,13 @@ class Search:
     ) -> Fitted | None:
         """Return the fit of a model; None where it cannot be followed or comes to no cost below `hope`."""
         noise = None if start is None else start.noise
+        known = start is not None and start.layout.borders is layout.borders
+        splines = start.followed.splines if start is not None and known else None
         with np.errstate(all="ignore"):
             try:
-                return fit(model, layout, near, structure=self.structure, noise=noise, steps=steps, hope=hope)
+                return fit(
+                    model, layout, near, structure=self.structure, noise=noise, steps=steps, hope=hope, splines=splines
+                )
             except np.linalg.LinAlgError:
                 return None
 

@@ -195,14 +195,13 @@ class Sight:
             dynamics.sites, dynamics.order, dynamics.is_complex, levels, dynamics.ends, every, dynamics.sites - 1
         )
         scene = self._scene(chain, line)
-        rate = dynamics.linear(line.coefficients, self.times, line.nodes, derivatives=False)[0]
-        field, slope = (dynamics.whole(one, None)[:, :levels] for one in (line.nodes, rate))
+        field = dynamics.whole(line.nodes, None)[:, :levels]
         every_place = (one for effect in CATALOGUE for one in way_of(effect).places(effect, scene))
         placed = [one for one in every_place if len(one.strength) < chain.sites - 1]
         pushing = []
         for one in placed:
             if one.instrument:
-                by = one.misread(self.times, field, slope).by[: len(one.strength)]
+                by = one.misread(self.times, field).by[: len(one.strength)]
                 yield self._rows(np.moveaxis(self._full(by), 1, 0))
             elif (ends := one.other_ends()) is not None:
                 other = replace(self._stretches, dynamics=replace(dynamics, ends=ends))

@@ -17,15 +17,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Clock(Placed, acts="clock"):
-    """Readings are taken at t + strength (t - begin), to first order: u + strength (t - begin) du/dt.
+    """The clock is slow: when it shows t, 1 + strength times as much time has gone by since the first row.
 
-    Without velocities another unit of time does the same, so that it is tried only with them.
-
-    Attributes:
-        begin: the first time.
+    By such a clock everything is quicker by that factor. Velocities are read as what they are, which is less than the
+    change of the positions by the clock. Without velocities another unit of time does the same, so that it is tried
+    only with them.
     """
 
-    begin: float
     instrument: ClassVar[bool] = True
     separated_by: ClassVar[str] = (
         "a recording by a second clock: it shows the same motion, but not the same faults of time"
@@ -35,16 +33,22 @@ class Clock(Placed, acts="clock"):
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return the one place, where velocities were read."""
         if effect.texts(scene.chain.order, scene.chain.is_complex) and scene.chain.levels == 2:
-            yield cls(effect=effect, begin=scene.begin, strength=(0.0,))
+            yield cls(effect=effect, strength=(0.0,))
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return what the number is."""
         return ("slowness of the clock",)
 
-    def misread(self, t: ndarray, field: ndarray, rate: ndarray) -> Misreading:
-        """Return what the error of the time adds."""
-        by = ((t - self.begin)[:, None, None, None] * rate)[None]
-        return Misreading(np.tensordot(self.strength, by, 1), np.zeros_like(field), by)
+    def quickened(self) -> float:
+        """Return the slowness of the clock."""
+        return self.strength[0]
+
+    def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
+        """Return what velocities lack."""
+        share = 1 / (1 + self.strength[0])
+        by, slope = np.zeros((1, *field.shape)), np.zeros_like(field)
+        by[0, :, 1], slope[:, 1] = -(share**2) * field[:, 1], share - 1
+        return Misreading(slope * field, slope, by)
 
     def sentences(self, chain: Chain) -> list[str]:
         """Return the error."""

@@ -42,7 +42,7 @@ class Curve(Placed, acts="curve"):
         """Return the columns that are bent."""
         return ("curve of u" + (" and v" if self.both else ""),)
 
-    def misread(self, t: ndarray, field: ndarray, rate: ndarray) -> Misreading:  # noqa: ARG002
+    def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
         """Return what the bend adds."""
         by, slope = np.zeros((1, *field.shape)), np.zeros_like(field)
         u = field[:, 0]

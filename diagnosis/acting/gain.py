@@ -56,7 +56,7 @@ class Gain(OfSensors, acts="gain"):
             return f"re{site + 1} and im{site + 1}"
         return f"u{site + 1}" + (f" and v{site + 1}" if self.both else "")
 
-    def misread(self, t: ndarray, field: ndarray, rate: ndarray) -> Misreading:  # noqa: ARG002
+    def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
         """Return what the factors add."""
         by, slope = np.zeros((len(self.strength), *field.shape)), np.zeros_like(field)
         levels = slice(None) if self.both else slice(0, 1)

@@ -49,7 +49,7 @@ class Offset(OfSensors, acts="offset"):
         columns = ("re", "im") if self.parts == 2 else ("u",)
         return tuple(f"offset of {name}{site + 1}" for site in self.sites for name in columns)
 
-    def misread(self, t: ndarray, field: ndarray, rate: ndarray) -> Misreading:  # noqa: ARG002
+    def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
         """Return the offsets, and what each adds."""
         by = np.zeros((len(self.strength), *field.shape))
         for k, site in enumerate(self.sites):

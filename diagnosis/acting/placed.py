@@ -238,12 +238,16 @@ class Placed(ABC):
         """Return the site whose whole right-hand side is multiplied by 1 + the strength; None where there is none."""
         return None
 
+    def quickened(self) -> float | None:
+        """Return the excess over 1 of how fast all goes by the recording's clock; None where that is right."""
+        return None
+
     def other_ends(self) -> Ends | None:
         """Return how the chain ends instead of as declared; None where that does not change."""
         return None
 
-    def misread(self, t: ndarray, field: ndarray, rate: ndarray) -> Misreading:
-        """Return what the instrument makes of a field (rows, levels, parts, N); `rate` is its time derivative."""
+    def misread(self, t: ndarray, field: ndarray) -> Misreading:
+        """Return what the instrument makes of a field (rows, levels, parts, N)."""
         raise NotImplementedError(f"{self.effect.name} acts on the motion, not on readings")
 
     @property

@@ -94,10 +94,8 @@ def test_unread_undoes_what_instruments_do(name, velocities):
         model = Model(DECLARED, 2, TRUTH, (strong,))
         field = motion(EVEN).reshape(len(EVEN), 2, 1, SITES)
         levels = field[:, : problem.chain.levels]
-        rates = np.zeros_like(levels)
-        rates[:, 0] = field[:, 1]
         reading = field.copy()
-        reading[:, : problem.chain.levels] += strong.misread(EVEN, levels, rates).added
+        reading[:, : problem.chain.levels] += strong.misread(EVEN, levels).added
         found = unread(model, layout, 0, reading.reshape(len(EVEN), -1))
         seen = found.reshape(field.shape)[:, : problem.chain.levels]
         np.testing.assert_allclose(seen, levels, atol=1e-3)
@@ -143,3 +141,17 @@ def test_a_long_recording_is_used_thinned_and_in_windows():
     assert len(parts) == WINDOWS
     assert sum(len(one.t) for one in parts) <= LONG
     assert (parts[0].t[0], parts[-1].t[-1]) == (thin.t[0], thin.t[-1])
+
+
+def test_with_a_slow_clock_positions_go_faster_than_velocities_say():
+    slow = 0.02
+    from_clock = motion((1 + slow) * EVEN)
+    u, v = from_clock[:, :SITES], from_clock[:, SITES:]
+    problem = Problem.of(DECLARED, 2, [Samples(EVEN, u, v, ends="free")], CATALOGUE)
+    clock = next(one for one in problem.candidates if one.effect.name == "clock")
+    layout = Layout.of(problem, len(EVEN), None, 1e-4)
+    near = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
+    model = Model(DECLARED, 2, TRUTH, (clock,))
+    found = fit(model, layout.with_substeps(model, near, problem.top), near, structure=Structure()).model
+    # The coefficients are those by a right clock.
+    np.testing.assert_allclose([*found.coefficients, *found.effects[0].strength], [*TRUTH, slow], rtol=1e-3)

@@ -3,7 +3,8 @@
 The size z of an effect is Wald's: the length of the vector of its parameters in units of its Cramer-Rao covariance,
 everything else being unknown (declared coefficients, initial state, the other effects). For one parameter this is its
 value over its standard error. It is computed at the motion with all effects in it and for the noise that the readings
-have. Where the ends are unknown, the outer sites are taken as read without noise, so that z is a little too large.
+have. Where the ends are unknown, what the outer sites did is unknown, too; of chains longer than `sight.SHORT` they are
+taken as read without noise, so that z is a little too large.
 
 Motions are solved by SciPy's DOP853 to a relative tolerance of 1e-10. Dry friction has a thin layer, see
 `chains.LAYER`.
@@ -159,8 +160,8 @@ def _attempt(draw: np.random.Generator, wanted: _Wanted, seed: int) -> LabRecord
     sized = None if chosen is None else _sized(experiment, chosen, draw)
     if chosen is None or sized is None:
         return None
-    amounts, sight = sized
-    effects = _effects(experiment, chosen, amounts, sight)
+    amounts, sight, border = sized
+    effects = _effects(experiment, chosen, amounts, sight, border)
     if effects is None:
         return None
     noisy = instrument.read(sight.clean, taken, sight.rms, draw)
@@ -194,7 +195,8 @@ def _chosen(experiment: Experiment, wanted: _Wanted, draw: np.random.Generator) 
     weights = np.array([OFTEN.get(name, 1.0) for name in possible])
     order = draw.choice(len(possible), size=len(possible), replace=False, p=weights / weights.sum())
     pool = [draw_ingredient(possible[k], chain, reach, draw) for k in order[: wanted.count + SPARE]]
-    sight = experiment.look(pool, np.zeros(len(pool)), ROUGH)
+    none = np.zeros(len(pool))
+    sight = experiment.look(pool, none, ROUGH, experiment.border(pool, none))
     if sight is None:
         return None
     found: list[int] = []
@@ -214,15 +216,16 @@ def _chosen(experiment: Experiment, wanted: _Wanted, draw: np.random.Generator) 
 
 def _sized(
     experiment: Experiment, chosen: Sequence[Ingredient], draw: np.random.Generator
-) -> tuple[ndarray, Sight] | None:
-    """Return the amounts of effects and what is seen with them; None where they make no recording."""
+) -> tuple[ndarray, Sight, ndarray | None] | None:
+    """Return the amounts of effects, what is seen with them and of the border; None where they make no recording."""
     every = range(len(chosen))
     target = np.exp(draw.uniform(np.log(1.2 * SMALLEST), np.log(LARGEST), size=len(chosen)))
     most = np.array([one.most for one in chosen])
     strong = np.array([one.strong for one in chosen])
     amounts = np.zeros(len(chosen))
+    border = experiment.border(chosen, amounts)
     for _ in range(1 + SIZINGS if len(chosen) else 0):
-        sight = experiment.look(chosen, amounts, ROUGH)
+        sight = experiment.look(chosen, amounts, ROUGH, border)
         if sight is None:
             return None
         unit = np.array([sight.left(k, every) for k in every])
@@ -234,16 +237,17 @@ def _sized(
             break
         # Not all at once: effects that are strong change what is seen of the others.
         amounts = np.minimum(amounts * np.clip(aimed / amounts, 0.25, 4) ** 0.9, most)
-    sight = experiment.look(chosen, amounts, FINE)
+    border = experiment.border(chosen, amounts)
+    sight = experiment.look(chosen, amounts, FINE, border)
     if sight is None or not sight.moves:
         return None
     if any(sight.size(k, every) < SMALLEST or sight.apart(k, every) < APART for k in every):
         return None
-    return amounts, sight
+    return amounts, sight, border
 
 
 def _effects(
-    experiment: Experiment, chosen: Sequence[Ingredient], amounts: ndarray, sight: Sight
+    experiment: Experiment, chosen: Sequence[Ingredient], amounts: ndarray, sight: Sight, border: ndarray | None
 ) -> tuple[LabEffect, ...] | None:
     """Return what is in a recording, with the effects that would do the same in each one's place.
 
@@ -253,7 +257,7 @@ def _effects(
         return ()
     there = {(one.name, one.site) for one in chosen}
     others = [one for one in candidates(experiment.chain, experiment.reach) if (one.name, one.site) not in there]
-    wide = experiment.look([*chosen, *others], np.concatenate([amounts, np.zeros(len(others))]), ROUGH)
+    wide = experiment.look([*chosen, *others], np.concatenate([amounts, np.zeros(len(others))]), ROUGH, border)
     if wide is None:
         return None
     every = range(len(chosen))

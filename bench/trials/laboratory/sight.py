@@ -2,10 +2,14 @@
 
 Sensitivities are differences between copies of the chain, which differ in one parameter each and are solved together
 with the same steps, so that the errors of the integration cancel.
+
+Where the ends of a short chain are unknown, what its outer sites did is unknown, too, but for their readings: each
+follows a B-spline in time, whose coefficients are parameters like the others.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -16,6 +20,7 @@ from latticebench.bench.trials.information import explained
 from latticebench.bench.trials.laboratory.chains import Chain
 from latticebench.bench.trials.laboratory.effects import Ingredient
 from latticebench.bench.trials.laboratory.instruments import Instrument
+from latticebench.methods.engine.bsplines import BSplines
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -24,6 +29,9 @@ if TYPE_CHECKING:
 # The last fifth of the readings must be at least this share of them all (RMS about the mean), and no swing larger than
 # so many times the chain's size.
 MOVING, BOUND = 0.12, 4.0
+# B-splines of an outer site in each of its fastest waves, their degree, and the longest chain for which they are
+# unknown: the two of a longer one at either end would be thousands.
+PER_WAVE, DEGREE, SHORT = 6, 5, 8
 
 
 @dataclass(frozen=True)
@@ -124,7 +132,8 @@ class Experiment:
         instrument: what reads.
         times: when it does.
         gone: readings that are missing.
-        reach: sites at either end that are only read, where the ends are unknown.
+        reach: sites at either end that are only read, where the ends are unknown; without noise if there are more than
+            `SHORT` sites.
     """
 
     chain: Chain
@@ -133,8 +142,21 @@ class Experiment:
     gone: Bool[ndarray, "time sites"]
     reach: int
 
-    def look(self, effects: Sequence[Ingredient], amounts: ndarray, accuracy: Accuracy) -> Sight | None:
-        """Return what is seen of effects of these amounts; None where the motion is unbounded."""
+    def look(
+        self,
+        effects: Sequence[Ingredient],
+        amounts: ndarray,
+        accuracy: Accuracy,
+        border: Float[ndarray, "time sites splines"] | None = None,
+    ) -> Sight | None:
+        """Return what is seen of effects of these amounts; None where the motion is unbounded.
+
+        Args:
+            effects: that are looked at.
+            amounts: of them.
+            accuracy: of the integration.
+            border: what the splines of the outer sites do to the readings; nothing if None, as where there are none.
+        """
         table = self._declared()
         parts = []
         for one, amount in zip(effects, amounts, strict=True):
@@ -149,20 +171,52 @@ class Experiment:
         clean = readings[0]
         rms = float(np.sqrt(np.mean(np.var(clean, axis=0))))
         columns = np.moveaxis((readings[1:] - clean) / accuracy.step, 0, -1)
+        if border is not None:
+            columns = np.concatenate([columns, border], axis=2)
         weighed = self.instrument.whitened(columns, clean, rms) * ~self.gone.reshape(-1, 1)
         limits = np.array([one.most for one in effects])
         return Sight(clean, rms, weighed.T @ weighed, tuple(parts), np.asarray(amounts), limits)
 
-    def _declared(self) -> _Table:
+    def border(self, effects: Sequence[Ingredient], amounts: ndarray) -> Float[ndarray, "time sites splines"] | None:
+        """Return what the splines of the outer sites do to the readings, with effects of these amounts.
+
+        None where there are none, or where the motion is unbounded.
+        """
+        if self._border is None:
+            return None
+        table = self._declared(free=False)
+        for one, amount in zip(effects, amounts, strict=True):
+            for name, value in one.values(amount).items():
+                table.add(one.key(name), value, one.unit(name), free=False)
+        for k in self._outer:
+            for j in range(self._border.count):
+                table.add(f"border.{k}.{j}", 0.0, self.chain.size)
+        readings = self._readings(table.copies(ROUGH.step), ROUGH.tolerance)
+        return None if readings is None else np.moveaxis((readings[1:] - readings[0]) / ROUGH.step, 0, -1)
+
+    def _declared(self, *, free: bool = True) -> _Table:
         """Return the start and the declared coefficients."""
         chain, table = self.chain, _Table()
         for level, unit in enumerate((chain.size, chain.size * chain.fast)):
             for k in range(chain.sites):
                 inner = self.reach <= k < chain.sites - self.reach
-                table.add(f"start.{level}.{k}", chain.start[level, k], unit, free=inner)
+                table.add(f"start.{level}.{k}", chain.start[level, k], unit, free=free and inner)
         for text, value in zip(chain.declared, chain.coefficients, strict=True):
-            table.add(text, value, abs(value))
+            table.add(text, value, abs(value), free=free)
         return table
+
+    @property
+    def _outer(self) -> list[int]:
+        return [k for k in range(self.chain.sites) if not self.reach <= k < self.chain.sites - self.reach]
+
+    @functools.cached_property
+    def _border(self) -> BSplines | None:
+        """The B-splines that what an outer site did is made of; None where nothing is unknown of it."""
+        if not self.reach or self.chain.sites > SHORT:
+            return None
+        end = float(self.times[-1])
+        intervals = max(1, round(PER_WAVE * self.chain.fast * end / (2 * np.pi)))
+        return BSplines.clamped(np.linspace(0.0, end, intervals + 1), DEGREE)
 
     def _readings(self, of: Mapping[str, ndarray], tolerance: float) -> Float[ndarray, "copies time sites"] | None:
         """Return the readings of copies of the chain with these parameters; None where one is unbounded."""
@@ -170,13 +224,16 @@ class Experiment:
 
         chain, sites = self.chain, self.chain.sites
         start = np.stack([np.concatenate([of[f"start.{level}.{k}"] for k in range(sites)], axis=1) for level in (0, 1)])
-        outer = [k for k in range(sites) if not self.reach <= k < sites - self.reach]
-        sensors = _Sensors(of, sites)
-        moving = {name: value for name, value in of.items() if not name.startswith("start.") and np.any(value != 0)}
+        outer, sensors, beyond = self._outer, _Sensors(of, sites), _Beyond.of(of, self._outer, self._border)
+        known = ("start.", "border.")
+        moving = {name: value for name, value in of.items() if not name.startswith(known) and np.any(value != 0)}
+
+        def held(t: float, u: ndarray) -> ndarray:
+            return beyond.moved(t, sensors.held(u, outer))
 
         def rate(t: float, y: ndarray) -> ndarray:
             u, v = y.reshape(start.shape)
-            return np.concatenate([v.ravel(), chain.rate(t, sensors.held(u, outer), v, moving).ravel()])
+            return np.concatenate([v.ravel(), chain.rate(t, held(t, u), v, moving).ravel()])
 
         def lost(_t: float, y: ndarray) -> float:
             return BOUND * chain.size - float(np.max(np.abs(y[:sites])))
@@ -191,7 +248,8 @@ class Experiment:
         if found.status != 0 or not np.all(np.isfinite(found.y)):
             return None
         u = np.moveaxis(found.y.reshape(*start.shape, -1)[0], -1, 0)
-        return np.moveaxis(np.stack([sensors.read(sensors.held(row, outer)) for row in u]), 0, 1)
+        pairs = zip(self.times, u, strict=True)
+        return np.moveaxis(np.stack([sensors.read(held(float(t), row)) for t, row in pairs]), 0, 1)
 
 
 class _Table:
@@ -217,6 +275,37 @@ class _Table:
         found = {name: np.full((len(self.units) + 1, 1), value) for name, value in self.values.items()}
         for name, place in self.places.items():
             found[name][place + 1] += step * self.units[place]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Beyond:
+    """By how much outer sites are elsewhere than their readings say, per copy.
+
+    Attributes:
+        outer: the sites.
+        basis: B-splines in time, or None where they are where they are read.
+        splines: coefficients of each site (site, copies, splines).
+    """
+
+    outer: Sequence[int]
+    basis: BSplines | None
+    splines: Float[ndarray, "site copies splines"]
+
+    @classmethod
+    def of(cls, parameters: Mapping[str, ndarray], outer: Sequence[int], basis: BSplines | None) -> _Beyond:
+        if basis is None or not any(name.startswith("border.") for name in parameters):
+            return cls(outer, None, np.zeros((0, 0, 0)))
+        rows = [[parameters[f"border.{k}.{j}"] for j in range(basis.count)] for k in outer]
+        return cls(outer, basis, np.stack([np.concatenate(one, axis=1) for one in rows]))
+
+    def moved(self, t: float, u: Float[ndarray, "copies sites"]) -> ndarray:
+        if self.basis is None:
+            return u
+        (first,), (curve,), _ = self.basis.basis(np.array([t]))
+        found = u.copy()
+        for site, splines in zip(self.outer, self.splines, strict=True):
+            found[:, site] += splines[:, first : first + len(curve)] @ curve
         return found
 
 

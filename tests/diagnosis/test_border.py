@@ -1,0 +1,81 @@
+"""Unknown ends: outer sites are read with noise, and what they really did is fitted along with the rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from latticebench.diagnosis.fitting import fit
+from latticebench.diagnosis.horizon import Layout, follow, linearised
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.noise import Structure
+from latticebench.diagnosis.problem import Problem
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+
+SITES, T = 5, np.linspace(0, 30, 301)
+DECLARED, TRUTH = library("chain", "u[n+1]+u[n-1]-2*u[n]; u[n]"), (2.0, -1.5)
+NOISE = 0.02
+
+
+def rate(_, y):
+    u, v = np.split(y, 2)
+    beside = np.concatenate([u[1:], [0]]) + np.concatenate([[0], u[:-1]])
+    return np.concatenate([v, 2.0 * (beside - 2 * u) - 1.5 * u])
+
+
+def problem(seed, noise=NOISE):
+    """Return a chain between walls of which nobody says so."""
+    draw = np.random.default_rng(seed)
+    start = draw.normal(size=2 * SITES)
+    u = solve_ivp(rate, (0, T[-1]), start, t_eval=T, rtol=1e-10, atol=1e-12).y[:SITES].T
+    samples = Samples(T, u + noise * draw.normal(size=u.shape), ends="unknown")
+    return Problem.of(DECLARED, 2, [samples], ())
+
+
+def laid_out(one, length):
+    layout = Layout.of(one, length, None, 1e-4)
+    near = [nodes[rows] for nodes, rows in zip(one.nodes, layout.rows, strict=True)]
+    model = Model(DECLARED, 2, TRUTH)
+    return model, layout.with_substeps(model, near, one.top), near
+
+
+def test_derivatives_by_the_curves_of_the_border_are_those_of_differences():
+    one = problem(1)
+    model, layout, near = laid_out(one, 60)
+    border = layout.borders[0]
+    followed = linearised(follow(model, layout, near), layout)
+    size, step = followed.size, 1e-5
+    for column in (0, 3, border.size - 1):
+        change = np.zeros((layout.pieces, border.size))
+        change[2, column] = step
+        moved = [layout.bordered(0, followed.splines[0], change)]
+        # From the same initial states: closing the gaps keeps the first state of each piece.
+        other = follow(model, layout, followed.nodes, splines=moved)
+        found = ((other.level - followed.level) / step).reshape(layout.pieces, -1)
+        wanted = followed.slope[:, :, size + column].reshape(layout.pieces, -1)
+        np.testing.assert_allclose(found[2], wanted[2], atol=2e-4 * np.max(np.abs(wanted)))
+        # No piece has numbers of another one.
+        assert np.max(np.abs(np.delete(found, 2, axis=0))) < 1e-6
+
+
+def test_without_noise_the_curves_of_the_border_do_no_harm():
+    one = problem(2, noise=0.0)
+    model, layout, near = laid_out(one, 301)
+    found = fit(replace(model, coefficients=(1.9, -1.4)), layout, near, structure=Structure())
+    np.testing.assert_allclose(found.model.coefficients, TRUTH, rtol=3e-3)
+
+
+@pytest.mark.slow
+def test_standard_errors_hold_where_the_border_is_noisy():
+    wrong = []
+    for seed in range(20):
+        one = problem(100 + seed)
+        model, layout, near = laid_out(one, 301)
+        found = fit(model, layout, near, structure=Structure())
+        wrong.append((np.array(found.model.coefficients) - TRUTH) / found.stderr)
+    # Of 40 values; the mean square of normal ones is 0.6 to 1.5 in 95 of 100 cases.
+    assert 0.4 < np.mean(np.square(wrong)) < 1.8
