@@ -14,7 +14,7 @@ import pydantic
 
 from latticebench import systems
 from latticebench.bench.axes import Listed, Seeds
-from latticebench.bench.case import Case, Folders, Number, Roots, Settings
+from latticebench.bench.case import Case, Folders, Number, Roots, Settings, plain
 from latticebench.bench.trials import faults, specimen
 from latticebench.bench.trials.specimen import Conditions, Specimen
 from latticebench.diagnosis.repair import Diagnosis, diagnose
@@ -197,13 +197,17 @@ def is_right(effect: str, named: list[str], alike: list[list[str]], verdict: str
 
 
 def _errors(found: Diagnosis, sigma: float | None) -> dict[str, Any]:
-    """Return the errors before and after; the noise is that of u, of a complex field that of both parts together."""
+    """Return the errors before and after; the noise is that of u, of a complex field that of both parts together.
+
+    A forecast that runs away is infinite.
+    """
     first = found.data[0]
     parts = np.sqrt(2) if first.is_complex else 1.0
-    return {
+    errors = {
         "noise_found": float(parts * np.sqrt(np.nanmean(found.noise[: first.sites] ** 2))), "noise_true": sigma,
         "residual_before": found.residual[0], "residual_after": found.residual[1],
         "forecast_before": found.forecast[0], "forecast_after": found.forecast[1],
         "coefficients_before": None if found.coefficients is None else found.coefficients[0],
         "coefficients_after": None if found.coefficients is None else found.coefficients[1],
     }  # fmt: skip
+    return {name: None if value is None else plain(float(value)) for name, value in errors.items()}
