@@ -8,15 +8,9 @@ Evidence is in nats: natural logarithms of likelihood ratios. `results/loop/rule
 FALSE_ALARM = 0.005
 # Chance that such a diagnosis finds something without a name.
 FALSE_DOUBT = 0.005
-# Nats that an effect must bring besides if it is a stand-in for many others: a priori it is less often what is missing.
-STAND_IN = 8.0
-STAND_INS = frozenset({
-    "gradient", "trap", "asymmetric-coupling", "memory", "parametric-drive", "kick", "sensor-curve", "long-range",
-    "disorder", "clock", "onsite-quintic", "gain-loss",
-})  # fmt: skip
 # Nats besides for an influence that swings at a frequency of the motion itself, a multiple or a sum: a wrong equation
 # leaves just that. Where rounding makes the noise, it leaves lines at any frequency.
-LOCKED = 30.0
+LOCKED = 10.0
 # Effects that feed readings back into the motion: what they bring is such an influence, too.
 FED = frozenset({"memory"})
 # Models that are carried to the next horizon, and how many nats they may be behind the best one.

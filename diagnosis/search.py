@@ -357,22 +357,18 @@ class Search:
                         yield found
 
     def _exchanged(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
-        """Yield models with another effect in the place of one: a likelier one, or one whose score is higher."""
+        """Yield models with a likelier effect in the place of one."""
         for number, placed in enumerate(fitted.model.effects):
-            many = placed.effect.name in rules.STAND_INS
-            found = [one for one in self.standing_in(fitted, number) if self._rather(one, placed, many)]
+            found = [one for one in self.standing_in(fitted, number) if self._rather(one, placed)]
             for one in found[:2]:
                 model = fitted.model.without(number).with_effect(one.placed)
                 if model.key not in pool:
-                    hope = np.inf if many else fitted.cost
-                    other = self.exchanged(fitted, number, one.placed, hope)
+                    other = self.exchanged(fitted, number, one.placed, fitted.cost)
                     if other is not None:
                         yield other
 
-    def _rather(self, one: Scored, placed: Placed, many: bool) -> bool:
-        """Return whether a candidate is to be tried in the place of an effect, which may stand in for many."""
-        if many:
-            return one.placed.effect.name not in rules.STAND_INS
+    def _rather(self, one: Scored, placed: Placed) -> bool:
+        """Return whether a candidate is to be tried in the place of an effect."""
         # To first order; a candidate's gain is its share of what the effect does.
         return one.won * (1 - 1 / one.gain) / 2 + self.problem.price_of(placed) > 1 + self.problem.price_of(one.placed)
 
