@@ -79,7 +79,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="sends SIGKILL")
 
 @posix
 def test_a_writing_run_that_is_killed_a_few_times_loses_nothing_and_has_nothing_twice(tmp_path: Path) -> None:
-    hold_after_kills(tmp_path / "store", 3)
+    hold_after_kills(tmp_path / "store", 2)
 
 
 @posix
@@ -91,7 +91,7 @@ def test_a_writing_run_that_is_killed_fifty_times_loses_nothing_and_has_nothing_
 def test_two_stores_that_are_made_in_one_folder_at_once_are_one(tmp_path: Path) -> None:
     folder = tmp_path / "store"
     command = [sys.executable, "-c", WRITER, str(folder), "0", "40"]
-    writers = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    writers = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     for writer in writers:
         out, _ = writer.communicate(timeout=300)
         assert writer.returncode == 0

@@ -80,27 +80,26 @@ def test_a_case_that_fails_hangs_dies_or_eats_memory_is_a_row_and_harms_no_other
         {
             "good": 'deed = "behave"', "failing": 'deed = "fail"', "eating": 'deed = "eat"',
             "hanging": 'deed = "hang in C"', "dying": 'deed = "die"', "empty": 'deed = "nan"', "slow": "seconds = 0.5",
-            "imaginary": 'deed = "complex"', "odd": 'deed = "object"',
+            "imaginary": 'deed = "complex"', "odd": 'deed = "object"', "good too": "seconds = 0.01",
         },
-        seeds="[1, 2]", limits={"hanging": "time_limit = 2", "eating": f"{LONG}\nmemory_limit = 1500"},
+        limits={"hanging": "time_limit = 2", "eating": f"{LONG}\nmemory_limit = 1500"},
     )  # fmt: skip
     results, tally = finished(suite, create(tmp_path / "store"), jobs=2)
-    found = {(r["case"]["label"], r["case"]["seed"]): r for r in results}
-    assert len(found) == tally.ran == 18
-    for seed in (1, 2):
-        assert found["good", seed]["status"] == found["slow", seed]["status"] == "ok"
-        assert found["failing", seed]["status"] == "failed"
-        assert "the matrix is on holiday" in found["failing", seed]["reason"]
-        assert found["eating", seed]["status"] == "memory"
-        assert "1500 MiB" in found["eating", seed]["reason"]
-        assert found["hanging", seed]["status"] == "timeout"
-        assert "2 s" in found["hanging", seed]["reason"]
-        assert found["dying", seed]["status"] == "died"
-        assert found["empty", seed]["status"] == "failed"
-        assert "not finite" in found["empty", seed]["reason"]
-        assert found["imaginary", seed]["status"] == found["odd", seed]["status"] == "failed"
-        assert "real" in found["imaginary", seed]["reason"]
-        assert "status must be a text" in found["odd", seed]["reason"]
+    found = {r["case"]["label"]: r for r in results}
+    assert len(found) == tally.ran == 10
+    assert found["good"]["status"] == found["slow"]["status"] == found["good too"]["status"] == "ok"
+    assert found["failing"]["status"] == "failed"
+    assert "the matrix is on holiday" in found["failing"]["reason"]
+    assert found["eating"]["status"] == "memory"
+    assert "1500 MiB" in found["eating"]["reason"]
+    assert found["hanging"]["status"] == "timeout"
+    assert "2 s" in found["hanging"]["reason"]
+    assert found["dying"]["status"] == "died"
+    assert found["empty"]["status"] == "failed"
+    assert "not finite" in found["empty"]["reason"]
+    assert found["imaginary"]["status"] == found["odd"]["status"] == "failed"
+    assert "real" in found["imaginary"]["reason"]
+    assert "status must be a text" in found["odd"]["reason"]
 
 
 def test_finished_cases_are_not_run_again_and_failures_only_when_asked(tmp_path: Path) -> None:
@@ -143,8 +142,8 @@ def test_a_changed_method_is_run_again_and_its_old_result_leaves_the_store(tmp_p
 
 def test_the_number_of_jobs_changes_no_digit(tmp_path: Path) -> None:
     (tmp_path / "small.toml").write_text(
-        '[methods.stlsq]\nmethod = "stlsq"\n[methods.weak]\nmethod = "weak"\n[[grid]]\nsystem = "phi4"\nsites = 9\n'
-        'samples = 60\nlibraries = ["lib1"]\nnoise = [0.0, 0.01]\n'
+        '[methods.lines]\nmethod = "least-squares"\n[methods.weak]\nmethod = "weak"\n[[grid]]\nsystem = "phi4"\n'
+        'sites = 9\nsamples = 60\nlibraries = ["lib1"]\nnoise = [0.0, 0.01]\n'
     )
     suite = load(str(tmp_path / "small.toml"))
     one, _ = finished(suite, create(tmp_path / "one"), jobs=1)
@@ -155,7 +154,7 @@ def test_the_number_of_jobs_changes_no_digit(tmp_path: Path) -> None:
         assert a["e2"] == b["e2"]
 
 
-StartRun = Callable[[Path, Path], "subprocess.Popen[bytes]"]
+StartRun = Callable[..., "subprocess.Popen[bytes]"]
 
 
 def end_group(leader: int) -> None:
@@ -168,13 +167,13 @@ def start_run() -> Iterator[StartRun]:
     """Start `latticebench run` in processes that are all ended with the test, whatever happens in it."""
     with ExitStack() as ends:
 
-        def start(suite: Path, store: Path) -> subprocess.Popen[bytes]:
+        def start(suite: Path, store: Path, jobs: int = 1) -> subprocess.Popen[bytes]:
             # A shell that starts tests in the background makes their children deaf to Ctrl-C.
             program = (
                 "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
                 "from latticebench.bench.cli import main; main()"
             )
-            options = ["run", str(suite), "--results", str(store), "--jobs", "2"]
+            options = ["run", str(suite), "--results", str(store), "--jobs", str(jobs)]
             command = [sys.executable, "-c", program, *options]
             runner = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
             ends.enter_context(runner)
@@ -202,7 +201,7 @@ def test_after_kill_9_of_the_runner_nothing_finished_is_run_again_and_no_worker_
     diary, gate, store = tmp_path / "diary", tmp_path / "gate", tmp_path / "store"
     methods = {"quick": f'diary = "{diary}"', "held": f'deed = "held", diary = "{diary}", gate = "{gate}"'}
     hostile_suite(tmp_path / "s", methods, seeds="[1, 2, 3]")
-    runner = start_run(tmp_path / "s" / "hostile.toml", store)
+    runner = start_run(tmp_path / "s" / "hostile.toml", store, jobs=2)
     wait_for(lambda: count(store) == 3 and len(diary_lines(diary)) == 5)
     workers = psutil.Process(runner.pid).children(recursive=True)
     runner.kill()
@@ -239,7 +238,7 @@ def test_ctrl_c_ends_at_once_with_the_finished_cases_kept(start_run: StartRun, t
     """At once: the case that is under way would never end by itself."""
     diary, store = tmp_path / "diary", tmp_path / "store"
     hostile_suite(tmp_path / "s", {"quick": "", "held": f'diary = "{diary}", gate = "{tmp_path / "never"}"'})
-    runner = start_run(tmp_path / "s" / "hostile.toml", store)
+    runner = start_run(tmp_path / "s" / "hostile.toml", store, jobs=2)
     wait_for(lambda: count(store) == 1 and len(diary_lines(diary)) == 1)
     workers = psutil.Process(runner.pid).children(recursive=True)
     os.killpg(runner.pid, signal.SIGINT)
