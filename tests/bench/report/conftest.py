@@ -1,11 +1,15 @@
-"""What the tests of reports share: published forms, and diagnoses, made by hand and by the search."""
+"""What the tests of reports share: published forms, diagnoses made by hand, and a browser."""
 
 from __future__ import annotations
 
+import html
 import json
+import re
+import shutil
+import subprocess
 from collections.abc import Callable
-from dataclasses import replace
 from importlib import resources
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,16 +17,17 @@ import jsonschema
 import numpy as np
 import pytest
 
-from latticebench import systems
+from latticebench.bench.report.content import content
+from latticebench.bench.report.curves import curves
 from latticebench.bench.report.document import Provenance, to_json
+from latticebench.bench.report.page import page
 from latticebench.bench.report.schema import DOCUMENTS
 from latticebench.diagnosis.acting import Chain, Placed, way_of
 from latticebench.diagnosis.acting.everywhere import Everywhere
 from latticebench.diagnosis.acting.gain import Gain
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Noise, Structure
-from latticebench.diagnosis.repair import Diagnosis, diagnose
-from latticebench.systems.effects import CATALOGUE, Effect, find
+from latticebench.systems.effects import Effect, find
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
 
@@ -49,64 +54,6 @@ def conforms() -> Conforms:
 @pytest.fixture(scope="session")
 def about() -> Provenance:
     return Provenance(command="latticebench diagnose", commit="c", date="d", machine="m", versions={}, seeds=[1])
-
-
-# By the search --------------------------------------------------------------------------------------------------------
-
-Diagnosed = Callable[[str, str, float], Diagnosis]
-
-
-@pytest.fixture(scope="session")
-def diagnosed() -> Diagnosed:
-    """Diagnose a specimen of a system that lacks an effect of a given size."""
-
-    from latticebench.bench.trials.specimen import Conditions, make
-
-    def run(system: str, effect: str, z: float) -> Diagnosis:
-        studied = systems.find(system)
-        specimen = make(studied, effect, z, np.random.default_rng(3), Conditions(sites=9, samples=40))
-        declared = studied.library("equation")
-        data = [replace(specimen.samples, ends=studied.ends)]
-        return diagnose(declared, studied.order, data, CATALOGUE).against(studied.truth(declared, {}))
-
-    return run
-
-
-@pytest.fixture(scope="session")
-def damped(diagnosed: Diagnosed) -> Diagnosis:
-    return diagnosed("phi4", "damping", 30)
-
-
-@pytest.fixture(scope="session")
-def driven(diagnosed: Diagnosed) -> Diagnosis:
-    return diagnosed("dnls", "drive", 30)
-
-
-@pytest.fixture(scope="session")
-def swing() -> Diagnosis:
-    """One pendulum, no velocities, rounded readings."""
-    from scipy.integrate import solve_ivp
-
-    t = np.arange(0, 12, 0.15)
-    u = solve_ivp(lambda _, y: [y[1], -np.sin(y[0])], (0, 12), [1.4, 0.0], t_eval=t, rtol=1e-9).y[0]
-    u = np.round(u + np.random.default_rng(2).normal(scale=0.01, size=len(t)), 2)
-    return diagnose(library("own", "sin(u[n])"), 2, [Samples(t, u[:, None], source="pendulum.csv")], CATALOGUE)
-
-
-@pytest.fixture(scope="session")
-def rough() -> Diagnosis:
-    """Two recordings, one of uneven times, both with gaps; a sensor that never answered."""
-    from latticebench.bench.trials.specimen import Conditions, make
-
-    specimen = make(systems.find("phi4"), "damping", 40, np.random.default_rng(3), Conditions(sites=9, samples=40))
-    draw = np.random.default_rng(1)
-    data = []
-    for kept in (np.arange(40), np.sort(draw.choice(40, 33, replace=False))):
-        u, v = specimen.samples.u[kept].copy(), specimen.samples.v[kept].copy()  # type: ignore[index]
-        u[draw.random(u.shape) < 0.1] = v[draw.random(v.shape) < 0.1] = np.nan
-        u[:, 3] = np.nan
-        data.append(Samples(specimen.samples.t[kept], u, v, source=f"part {len(data) + 1}.csv", ends="free"))
-    return diagnose(systems.find("phi4").library("equation"), 2, data, CATALOGUE)
 
 
 # By hand --------------------------------------------------------------------------------------------------------------
@@ -227,3 +174,83 @@ def chain_of() -> Callable[..., Chain]:
 @pytest.fixture(scope="session")
 def noise_of() -> Callable[..., Noise]:
     return _noise_of
+
+
+# In a browser ---------------------------------------------------------------------------------------------------------
+
+BROWSER = next(
+    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
+)
+
+
+def _browsed(path: Path, *, extra: tuple[str, ...] = ()) -> str:
+    """Open a page in a browser without a window and give its document back."""
+    if BROWSER is None:
+        pytest.skip("there is no Chromium; install Debian's package chromium")
+    command = [
+        BROWSER, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={path.parent / 'profile'}",
+        "--virtual-time-budget=3000", *extra, "--dump-dom", path.as_uri(),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    if done.returncode != 0 and not done.stdout:
+        pytest.skip(f"Chromium does not run here: {done.stderr[-200:]}")
+    return done.stdout
+
+
+MEASURE = """<script>addEventListener('load', () => {
+  const box = (one) => { const b = one.getBoundingClientRect(); return [b.width, b.height]; };
+  const every = (selector) => [...document.querySelectorAll(selector)];
+  const handled = (one) => [...one.attributes].some((a) => a.name.startsWith('on'));
+  const found = {
+    figures: every('figure svg').map(box), math: every('math').map(box), images: every('svg image, img').map(box),
+    text: document.body.innerText, title: document.title, scripts: document.scripts.length,
+    wide: document.documentElement.scrollWidth, window: innerWidth, handlers: every('*').filter(handled).length,
+  };
+  const out = document.createElement('pre');
+  out.id = 'measured';
+  out.textContent = JSON.stringify(found);
+  document.body.append(out);
+});</script>"""
+
+
+def _measured(text: str, path: Path, **options: tuple[str, ...]) -> dict[str, Any]:
+    """Measure a page with a script of the test's own; the page's policy against scripts is taken off for it."""
+    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text)
+    assert bare != text
+    path.write_text(bare.replace("</body>", MEASURE + "</body>"))
+    document = _browsed(path, **options)
+    inner = re.search(r'<pre id="measured">(.*?)</pre>', document, re.DOTALL)
+    assert inner is not None
+    found: dict[str, Any] = json.loads(html.unescape(inner[1]))
+    return found
+
+
+def _check_figures(diagnosis: Any, path: Path) -> None:
+    """Every figure and equation of a page has a size in a browser, and the page says what it should."""
+    found = _measured(page(content(diagnosis), curves(diagnosis), None), path, extra=("--window-size=1000,900",))
+    assert len(found["figures"]) == (5 if diagnosis.findings else 4)
+    for width, height in found["figures"]:
+        assert width > 200
+        assert height > 100
+    for width, height in [*found["math"], *found["images"]]:
+        assert width > 5
+        assert height > 5
+    words = (content(diagnosis).sentence, "How the search went", "Angular frequencies", "residual over the noise")
+    for text in words:
+        assert text in found["text"]
+    assert found["scripts"] == 1
+
+
+@pytest.fixture(scope="session")
+def browsed() -> Callable[..., str]:
+    return _browsed
+
+
+@pytest.fixture(scope="session")
+def measured() -> Callable[..., dict[str, Any]]:
+    return _measured
+
+
+@pytest.fixture(scope="session")
+def check_figures() -> Callable[[Any, Path], None]:
+    return _check_figures

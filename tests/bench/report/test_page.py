@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import shutil
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,14 +17,10 @@ from latticebench.bench.report.content import content
 from latticebench.bench.report.curves import curves
 from latticebench.bench.report.document import Provenance, to_dict
 from latticebench.bench.report.page import page, write_page
-from latticebench.bench.report.whereabouts import scaled_residuals, spectrum
-from latticebench.diagnosis.repair import Diagnosis
+from latticebench.bench.report.whereabouts import spectrum
 from latticebench.systems.errors import InputError
 
 Made = Callable[..., Any]
-BROWSER = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
-)
 EVIL = '<img src=x onerror="document.title=\'owned\'"><script>document.title="owned"</script>$\\frac{&.csv'
 
 
@@ -35,79 +28,14 @@ def page_of(diagnosis: Any, about: Provenance | None = None) -> str:
     return page(content(diagnosis), curves(diagnosis), about)
 
 
-def browsed(path: Path, *, extra: tuple[str, ...] = ()) -> str:
-    """Open a page in a browser without a window and give its document back."""
-    if BROWSER is None:
-        pytest.skip("there is no Chromium; install Debian's package chromium")
-    command = [
-        BROWSER, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={path.parent / 'profile'}",
-        "--virtual-time-budget=3000", *extra, "--dump-dom", path.as_uri(),
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    if done.returncode != 0 and not done.stdout:
-        pytest.skip(f"Chromium does not run here: {done.stderr[-200:]}")
-    return done.stdout
-
-
-MEASURE = """<script>addEventListener('load', () => {
-  const box = (one) => { const b = one.getBoundingClientRect(); return [b.width, b.height]; };
-  const every = (selector) => [...document.querySelectorAll(selector)];
-  const handled = (one) => [...one.attributes].some((a) => a.name.startsWith('on'));
-  const found = {
-    figures: every('figure svg').map(box), math: every('math').map(box), images: every('svg image, img').map(box),
-    text: document.body.innerText, title: document.title, scripts: document.scripts.length,
-    wide: document.documentElement.scrollWidth, window: innerWidth, handlers: every('*').filter(handled).length,
-  };
-  const out = document.createElement('pre');
-  out.id = 'measured';
-  out.textContent = JSON.stringify(found);
-  document.body.append(out);
-});</script>"""
-
-
-def measured(text: str, path: Path, **options: tuple[str, ...]) -> dict[str, object]:
-    """Measure a page with a script of the test's own; the page's policy against scripts is taken off for it."""
-    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text)
-    assert bare != text
-    path.write_text(bare.replace("</body>", MEASURE + "</body>"))
-    document = browsed(path, **options)
-    inner = re.search(r'<pre id="measured">(.*?)</pre>', document, re.DOTALL)
-    assert inner is not None
-    import html
-
-    found: dict[str, object] = json.loads(html.unescape(inner[1]))
-    return found
-
-
-def check_figures(diagnosis: Any, path: Path) -> None:
-    """Every figure and equation of a page has a size in a browser, and the page says what it should."""
-    found = measured(page_of(diagnosis), path, extra=("--window-size=1000,900",))
-    assert len(found["figures"]) == (5 if diagnosis.findings else 4)  # type: ignore[arg-type]
-    for width, height in found["figures"]:  # type: ignore[attr-defined]
-        assert width > 200
-        assert height > 100
-    for width, height in [*found["math"], *found["images"]]:  # type: ignore[misc]
-        assert width > 5
-        assert height > 5
-    words = (content(diagnosis).sentence, "How the search went", "Angular frequencies", "residual over the noise")
-    for text in words:
-        assert text in found["text"]  # type: ignore[operator]
-    assert found["scripts"] == 1
-
-
-@pytest.mark.parametrize("which", ["damped", "driven", "swing", "rough"])
-def test_the_page_shows_all_figures_and_equations_in_a_browser(
-    which: str, request: pytest.FixtureRequest, tmp_path: Path
+def test_a_page_without_effects_shows_what_there_is(
+    pendula: Made, check_figures: Callable[[Any, Path], None], tmp_path: Path
 ) -> None:
-    check_figures(request.getfixturevalue(which), tmp_path / "page.html")
-
-
-def test_a_page_without_effects_shows_what_there_is(pendula: Made, tmp_path: Path) -> None:
     plain = pendula()
     check_figures(pendula(findings=(), after=plain.before, verdict="nothing missing"), tmp_path / "page.html")
 
 
-def test_the_page_fits_a_phone(pendula: Made, tmp_path: Path) -> None:
+def test_the_page_fits_a_phone(pendula: Made, browsed: Callable[..., str], tmp_path: Path) -> None:
     # A window of Chromium's is at least 500 wide; a frame is as narrow as it is told to be.
     inner = tmp_path / "inner.html"
     write_page(content(pendula()), curves(pendula()), None, inner)
@@ -122,7 +50,9 @@ def test_the_page_fits_a_phone(pendula: Made, tmp_path: Path) -> None:
     assert int(title[1]) <= 360
 
 
-def test_no_script_from_a_name_survives_on_the_page(pendula: Made, about: Provenance, tmp_path: Path) -> None:
+def test_no_script_from_a_name_survives_on_the_page(
+    pendula: Made, about: Provenance, measured: Callable[..., dict[str, Any]], tmp_path: Path
+) -> None:
     about = about.model_copy(update={"command": f"latticebench diagnose {EVIL}"})
     data = tuple(replace(one, source=EVIL) for one in pendula().data)
     text = page_of(pendula(data=data, noise_lines=(EVIL,)), about)
@@ -132,10 +62,10 @@ def test_no_script_from_a_name_survives_on_the_page(pendula: Made, about: Proven
     assert found["title"] == "Diagnosis: explained"
     assert found["handlers"] == 0
     assert found["scripts"] == 1
-    assert EVIL in found["text"]  # type: ignore[operator]
+    assert EVIL in found["text"]
 
 
-def test_the_page_lets_nothing_run_or_load(pendula: Made, tmp_path: Path) -> None:
+def test_the_page_lets_nothing_run_or_load(pendula: Made, browsed: Callable[..., str], tmp_path: Path) -> None:
     text = page_of(pendula())
     # Even a script that got in would not run.
     (tmp_path / "page.html").write_text(text.replace("</body>", "<script>document.title='owned'</script></body>"))
@@ -144,16 +74,6 @@ def test_the_page_lets_nothing_run_or_load(pendula: Made, tmp_path: Path) -> Non
     for attribute, value in re.findall(r'\b(src|href|xlink:href)="([^"]*)"', text):
         assert value.startswith(("#", "data:")), attribute
     assert "url(http" not in text
-
-
-def test_each_recording_has_one_residual_however_many_pieces_it_was_followed_in(
-    rough: Diagnosis, pendula: Made
-) -> None:
-    assert [len(t) for t, _ in scaled_residuals(rough.before, rough)] == [40, 33]
-    assert "in 2 trajectories" in page_of(rough)
-    ((t, left),) = scaled_residuals(pendula().before, pendula())
-    assert len(t) == len(left) == 800
-    assert "trajectories" not in page_of(pendula())
 
 
 def test_the_page_says_once_what_cannot_be_told_apart_and_what_would_separate_it(pendula: Made) -> None:

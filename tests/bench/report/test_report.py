@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -11,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from latticebench import systems
 from latticebench.bench.report import rows
-from latticebench.bench.report.content import DiagnosisDocument, content, diagnosis_document
+from latticebench.bench.report.content import content, diagnosis_document
 from latticebench.bench.report.document import Provenance, to_json
 from latticebench.bench.report.findings import added
 from latticebench.bench.report.notes import notes, strays
@@ -23,28 +21,10 @@ from latticebench.bench.report.whereabouts import scaled_residuals, whereabouts
 from latticebench.diagnosis.acting import Chain, Placed
 from latticebench.diagnosis.acting.everywhere import Everywhere
 from latticebench.diagnosis.noise import Noise
-from latticebench.diagnosis.repair import Diagnosis
 from latticebench.systems.effects import CATALOGUE, Effect, find
 from latticebench.systems.samples import Samples
 
-Diagnosed = Callable[[str, str, float], Diagnosis]
 Made = Callable[..., Any]
-
-
-@pytest.mark.parametrize("which", ["damped", "driven", "swing", "rough"])
-def test_the_json_has_the_published_form_and_no_numbers_that_json_lacks(
-    which: str, request: pytest.FixtureRequest, about: Provenance, conforms: Callable[[str, str], object]
-) -> None:
-    diagnosis: Diagnosis = request.getfixturevalue(which)
-    text = to_json(diagnosis_document(content(diagnosis), about))
-    conforms("diagnosis", text)
-    found = DiagnosisDocument.model_validate_json(text)
-    assert list(found.declared) == list(diagnosis.after.model.declared.texts)
-    for horizon in found.horizons:
-        assert horizon.models[0].behind == 0
-        net = [one.gain - one.price for one in horizon.tried]
-        assert net == sorted(net, reverse=True)
-    assert (found.error.coefficients is None) == (which in ("swing", "rough"))
 
 
 def test_a_diagnosis_that_was_interrupted_says_so_first(
@@ -56,18 +36,6 @@ def test_a_diagnosis_that_was_interrupted_says_so_first(
     assert capsys.readouterr().out.startswith("Interrupted: ")
     show(content(pendula()))
     assert capsys.readouterr().out.startswith("What the equation lacks: ")
-
-
-def test_what_was_added_is_given_with_its_size_error_and_doubles(damped: Diagnosis) -> None:
-    found = content(damped)
-    (effect,) = found.effects
-    assert found.verdict == "explained"
-    assert {effect.effect, *effect.indistinguishable} >= {"damping"}
-    (value,), (error,) = effect.coefficients.values(), effect.stderr.values()
-    assert value < 0
-    assert 5 < -value / error < 100
-    assert found.error.residual.after == pytest.approx(1, abs=0.1)
-    assert found.error.criterion.after < 0
 
 
 # Numbers as people know them ------------------------------------------------------------------------------------------
@@ -97,30 +65,6 @@ def test_a_linear_force_is_said_as_a_change_of_the_frequency_too(pendula: Made) 
     assert list(added(unknown)[0].natural) == ["u[n]"]
 
 
-def test_a_drive_has_its_frequency_among_the_parameters_with_an_error(driven: Diagnosis) -> None:
-    (effect,) = added(driven)
-    assert effect.effect == "drive"
-    assert isinstance(effect.parameters["omega"], float)
-    assert 0 < effect.stderr["omega"] < 0.2 * effect.parameters["omega"]
-    assert len(effect.coefficients) == 4
-
-
-def test_a_mass_is_said_as_site_and_ratio(diagnosed: Diagnosed) -> None:
-    found = content(diagnosed("phi4", "unequal-masses", 30))
-    (effect,) = found.effects
-    assert effect.effect == "unequal-masses"
-    assert effect.parameters["site"] == 3
-    assert effect.natural["mass_ratio"].value == pytest.approx(1 / (1 + effect.coefficients["scale"]))
-    assert effect.natural["mass_ratio"].stderr > 0
-    assert any(line.startswith("site 3: its whole right-hand side") for line in found.equation.after.elsewhere)
-
-
-def test_a_sensor_is_named_by_the_column_of_the_file(diagnosed: Diagnosed) -> None:
-    (effect,) = added(diagnosed("phi4", "sensor-offset", 30))
-    assert list(effect.coefficients) == ["offset of u3"]
-    assert effect.parameters == {"site": 3}
-
-
 @pytest.mark.parametrize(("order", "is_complex"), [(2, False), (1, True), (1, False)])
 def test_every_number_of_every_effect_has_a_natural_form(
     order: int, is_complex: bool, forms: Callable[[Effect, Chain], list[Placed]], chain_of: Callable[..., Chain]
@@ -140,23 +84,6 @@ def test_the_noise_is_said_for_each_sensor_in_the_units_of_its_readings(pendula:
     found = content(pendula())
     assert found.noise == {"u1": 0.03, "u2": 0.02}
     assert found.noise_lines == ("sensor 1: 0.03", "sensor 2: 0.02")
-
-
-def test_the_noise_of_a_complex_field_is_that_of_each_part(driven: Diagnosis) -> None:
-    from latticebench.bench.trials.specimen import Conditions, make
-
-    studied = systems.find("dnls")
-    specimen = make(studied, "drive", 30, np.random.default_rng(3), Conditions(sites=9, samples=40))
-    found = np.array(list(content(driven).noise.values()))
-    assert np.sqrt(2 * np.mean(found**2)) == pytest.approx(specimen.samples.sigma, rel=0.1)
-
-
-def test_readings_on_a_grid_are_noted_with_what_rounding_does_to_the_noise(swing: Diagnosis) -> None:
-    (note,) = [line for line in notes(swing) if "multiples" in line]
-    share = float(re.search(r"makes ([\d.]+) %", note)[1])  # type: ignore[index]
-    noise = float(swing.noise[0])
-    assert "0.01" in note
-    assert share == pytest.approx(100 * 0.01**2 / 12 / noise**2, rel=0.05)
 
 
 def test_only_sensors_with_a_step_are_noted_to_have_one(pendula: Made) -> None:
@@ -190,17 +117,6 @@ def test_noise_of_any_kind_lives_nowhere_in_particular(
 
 
 # Where the residual lives, what is near, how the search went ----------------------------------------------------------
-
-
-def test_a_residual_that_is_noise_lives_nowhere_and_one_at_a_site_lives_there(
-    damped: Diagnosis, diagnosed: Diagnosed
-) -> None:
-    after = whereabouts(damped.after, damped)
-    assert len(after.sites) + len(after.times) + len(after.frequencies) <= 1
-    defect = diagnosed("phi4", "defect", 40)
-    before = whereabouts(defect.before, defect)
-    assert before.sites[0].site == added(defect)[0].parameters["site"]
-    assert f"site {before.sites[0].site}" in before.words[0]
 
 
 def test_modes_of_both_models_stand_beside_the_peaks_of_the_recording(pendula: Made) -> None:
