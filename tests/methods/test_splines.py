@@ -29,8 +29,8 @@ def seen(name, noise, seed, *, velocities=True, missing=0.0, ends=None, **option
     return replace(found, v=found.v if velocities else None, ends=ends or system.ends)
 
 
-def limit(system, candidates, noise):
-    return bound_of([replace(simulate(system), ends=system.ends)], candidates, system.order, noise=noise)
+def limit(system, candidates, noise, **options):
+    return bound_of([replace(simulate(system, **options), ends=system.ends)], candidates, system.order, noise=noise)
 
 
 def error(fit, truth):
@@ -51,8 +51,8 @@ def test_with_noise_the_error_is_near_the_bound(name, candidates):
     system = systems.find(name)
     one = system.library(candidates)
     truth = system.truth(one, {})
-    fits = [solve(Splines(), [seen(name, noise, seed)], one, system.order, 0) for seed in range(2)]
-    least = limit(system, one, noise)
+    fits = [solve(Splines(), [seen(name, noise, seed, sites=15)], one, system.order, 0) for seed in range(2)]
+    least = limit(system, one, noise, sites=15)
     assert np.sqrt(np.mean([error(fit, truth) ** 2 for fit in fits])) < 2 * least.relative
     assert np.median([fit.stderr / least.stderr for fit in fits]) == pytest.approx(1, abs=0.25)
 
