@@ -168,7 +168,7 @@ def survive_damage(made: Path, folder: Path, seeds: range) -> None:
 
 @posix
 def test_a_damaged_store_is_read_or_refused_in_one_line(made: Path, tmp_path: Path) -> None:
-    survive_damage(made, tmp_path, range(12))
+    survive_damage(made, tmp_path, range(8))
 
 
 @posix
@@ -217,7 +217,7 @@ FIT = ("--terms", "u[n]; u[n]**3", "--order", 2, "--ends", "free", "--method", "
 
 
 def test_damaged_data_are_fitted_or_refused_in_one_line(made: Path, tmp_path: Path) -> None:
-    survive_data(made, tmp_path, range(25))
+    survive_data(made, tmp_path, range(12))
 
 
 @pytest.mark.slow
@@ -369,7 +369,7 @@ def survive_suites(folder: Path, seeds: range) -> None:
 
 
 def test_odd_suites_are_loaded_or_refused_with_their_name(tmp_path: Path) -> None:
-    survive_suites(tmp_path, range(60))
+    survive_suites(tmp_path, range(30))
 
 
 @pytest.mark.slow

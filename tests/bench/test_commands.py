@@ -112,7 +112,7 @@ def survive_commands(folder: Path, seeds: range) -> None:
 
 @posix
 def test_odd_command_lines_work_or_are_refused_in_one_line(tmp_path: Path) -> None:
-    survive_commands(tmp_path, range(40))
+    survive_commands(tmp_path, range(25))
 
 
 @posix

@@ -18,7 +18,7 @@ ODD = st.text(alphabet="=+-@'\"|<>[]()`$_\\,;#\t\r\n\x1b\x00ab1.e \ud800é", max
 
 
 @given(text=ODD)
-@settings(derandomize=True, max_examples=300, deadline=None)
+@settings(derandomize=True, max_examples=100, deadline=None)
 def test_a_cell_of_a_csv_file_is_no_formula_and_comes_back(text: str) -> None:
     written = csv_table(pd.DataFrame({"a": [text], "b": [1.5]}))
     found = pd.read_csv(io.StringIO(written), dtype=str, keep_default_na=False)["a"][0]
@@ -29,7 +29,7 @@ def test_a_cell_of_a_csv_file_is_no_formula_and_comes_back(text: str) -> None:
 
 
 @given(text=ODD)
-@settings(derandomize=True, max_examples=300, deadline=None)
+@settings(derandomize=True, max_examples=100, deadline=None)
 def test_a_cell_of_markdown_begins_no_element_is_no_link_and_ends_no_cell(text: str) -> None:
     found = markdown(text)
     assert "<a" not in found
