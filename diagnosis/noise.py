@@ -6,9 +6,10 @@ for times that need not be even:
 
     y_k = rho_k y_(k-1) + sqrt(1 - rho_k^2) z_k,    rho_k = exp(-(t_k - t_(k-1)) / tau),
 
-and y = z at the first reading of a piece. The innovations z are independent and follow Student's t distribution with
-nu degrees of freedom (Lange, Little & Taylor, J. Am. Stat. Assoc. 84, 881, 1989), or the normal distribution. Which of
-these parts are used is the `Structure`; Schwarz' criterion (Ann. Stat. 6, 461, 1978) chooses it.
+and y = z at the first reading of a piece; an interval counts as at least `CLOSE` of the typical one. The innovations z
+are independent and follow Student's t distribution with nu degrees of freedom (Lange, Little & Taylor, J. Am. Stat.
+Assoc. 84, 881, 1989), or the normal distribution. Which of these parts are used is the `Structure`; Schwarz' criterion
+(Ann. Stat. 6, 461, 1978) chooses it.
 
 All likelihoods are natural logarithms with their normalising constants, so that those of different structures compare.
 """
@@ -39,7 +40,10 @@ LIGHTEST = 1000.0
 # Correlations from one typical reading to the next. A stronger one than the largest may stand for any slow misfit of
 # the equation, which the equation should have to answer for; below the least, the noise is white.
 MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
-# Two readings at nearly the same time: what is left between them must not be divided by zero.
+# Readings closer than this share of the typical interval correlate as over that: part of any noise is white, and of
+# white noise two readings at nearly the same time differ as any others.
+CLOSE = 0.25
+# What is left between strongly correlated readings must not be divided by zero.
 CLOSEST = 1e-4
 # Nats that each part of the structure must win beyond Schwarz' penalty. Four parts are tried, on records of less than a
 # hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100 records.
@@ -201,7 +205,8 @@ class Whitener:
 class _Chain:
     """The readings that were seen, channel after channel: their places in a flat array (channels, rows) and sensors.
 
-    `gap` is the time since the reading before, infinite where there is none in the same channel and piece.
+    `gap` is the time since the reading before, at least `CLOSE` of the typical one; infinite where there is none in the
+    same channel and piece.
     """
 
     where: Int[ndarray, " readings"]
@@ -220,7 +225,8 @@ def _chained(rows: Rows, seen: Seen) -> _Chain:
     linked = (np.diff(channel) == 0) & (np.diff(piece) == 0)
     gap = np.full(len(where), np.inf)
     gap[1:] = np.where(linked, np.diff(rows.times[row]), np.inf)
-    return _Chain(where, rows.sensor[channel], gap)
+    apart = gap[np.isfinite(gap) & (gap > 0)]
+    return _Chain(where, rows.sensor[channel], np.maximum(gap, CLOSE * np.median(apart)) if len(apart) else gap)
 
 
 def _minus_log_density(z: Float[ndarray, " readings"], tail: float) -> float:
