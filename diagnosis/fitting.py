@@ -256,9 +256,28 @@ def fit(
             break
     if cost > hope:
         return None
-    _, error, slope, _ = whitened(followed, noise, rows)
-    covariance = normal(layout, error, slope, followed.local, 0.0).covariance()
+    _, error, slope, robust = whitened(followed, noise, rows)
+    covariance = normal(layout, error, slope, followed.local, 0.0).covariance() * spread(error, robust, noise.tail)
     return Fitted(layout, followed, noise, cost, covariance, converged, rows)
+
+
+def spread(error: ndarray, robust: ndarray, tail: float) -> float:
+    """Return the variance of a robust fit's numbers over that of a weighted one (Huber, Ann. Stat. 1, 799 (1973)).
+
+    It is <psi^2> <w> / <psi'>^2 with psi = w z and w = (nu + 1) / (nu + z^2): the weights follow what is left, so that
+    their sum overstates what the readings tell, for Student's t by (nu + 3) / (nu + 1).
+
+    Args:
+        error: innovations times the roots of their weights, sqrt(w) z.
+        robust: sqrt(w), 0 where nothing was read.
+        tail: nu.
+    """
+    if not np.isfinite(tail):
+        return 1.0
+    read = robust > 0
+    weight = robust[read] ** 2
+    slope = weight * (2 * tail * weight / (tail + 1) - 1)
+    return float(np.mean((error * robust)[read] ** 2) * np.mean(weight) / max(float(np.mean(slope)), 0.1) ** 2)
 
 
 def gain(won: float, error: ndarray, count: float) -> float:
