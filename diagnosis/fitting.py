@@ -27,6 +27,8 @@ ENOUGH = 0.05
 BLIND = 2
 # Damping of the first step, the factors after a step that failed and one that did not, and how often one may fail.
 DAMPING, MORE, LESS, MOST_FAILURES = 1e-6, 30.0, 0.1, 5
+# A line of the spectrum stands so many times above the mean; one of noise does with a chance of exp(-LINE).
+LINE = 20.0
 # Directions of the numbers that the readings do not determine, as a share of the best determined one.
 UNDETERMINED = 1e-9
 
@@ -190,6 +192,20 @@ class Fitted:
         sensors = int(np.max(self.rows.sensor)) + 1
         squares = [self.followed.left[:, self.rows.sensor == k] ** 2 for k in range(sensors)]
         return np.array([np.sqrt(np.nanmean(one)) if np.any(np.isfinite(one)) else np.nan for one in squares])
+
+    def has_lines(self) -> bool:
+        """Return whether what is left swings at some frequency, as a misfit does and noise, correlated or not, does not.
+
+        Single outliers count as little as in the fit.
+        """
+        seen = np.isfinite(self.followed.left)
+        whitener = self.noise.whitener(self.followed.level, self.rows, seen)
+        error = whitener.apply(np.where(seen, self.followed.left, 0.0))
+        for column, read in zip((error * whitener.robust(error)).T, seen.T, strict=True):
+            power = np.abs(np.fft.rfft(column[read])[1:]) ** 2
+            if len(power) and np.max(power) > LINE * np.mean(power):
+                return True
+        return False
 
     def curves(self) -> list[Curve]:
         """Return what the model makes of each recording, where its pieces are."""

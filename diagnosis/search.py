@@ -145,9 +145,13 @@ class Search:
             length = self._next(length, settled)
 
     def lost(self, fitted: Fitted) -> bool:
-        """Return whether a model leaves much more of the readings than their own noise."""
+        """Return whether a model leaves much more of the readings than their own noise, and more than noise.
+
+        Of correlated noise, and of outliers, readings alone show only a part.
+        """
         noise = self.problem.noise
-        return bool(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0) > rules.LOST)
+        beyond = np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0) > rules.LOST
+        return bool(beyond) and fitted.has_lines()
 
     @property
     def _least(self) -> int:
