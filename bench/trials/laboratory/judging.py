@@ -2,6 +2,10 @@
 
 Each effect must be named, alone or in a group of effects that the diagnosis says it cannot tell apart, by a finding of
 its own; what is found beyond that is invented. Several offsets, or gains, of different sensors are one effect.
+
+Intervals are those of the model that is named. Gains are relative: where another sensor gives the unit of u than in the
+truth, true values are said in that unit. Where a force is named that does the same as the true one, or is at another
+site, the numbers of all forces are those beside that one, and none is compared; likewise of sensors.
 """
 
 from __future__ import annotations
@@ -24,6 +28,11 @@ if TYPE_CHECKING:
 
 # Effects of which one may be found at several sensors.
 ONE_FOR_ALL = ("sensor-offset", "sensor-gain")
+# The power of the unit of u by which the parameters of effects grow, where it is not 0.
+POWERS = {
+    "onsite-quadratic": -1, "onsite-cubic": -2, "onsite-quintic": -4, "nonlinear-coupling": -2, "quadratic-drag": -1,
+    "dry-friction": 1, "constant-force": 1, "drive": 1, "sensor-curve": -2, "sensor-gain": -1,
+}  # fmt: skip
 # Labels of values that are no coefficient of a term, with the names that recordings have for them.
 NAMED = {"omega": "omega", "curve of u": "curve", "scale": "scale"}
 # Half the width of a 95 % interval, in standard errors.
@@ -154,19 +163,59 @@ def judge(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding]) -> Judge
     invented = _beyond(truth, found, pairs)
     loose = matched(truth, found, alike=True)
     right_alike = None not in loose and not _beyond(truth, found, loose)
-    placed, covered = [], []
+    placed, covered, unit, others = [], [], _unit(truth, found, pairs), _others(truth, found, pairs)
     for one, j in zip(truth, pairs, strict=True):
         if j is None or found[j].name != one["name"]:
             continue
-        there = one["site"] == found[j].site
         if one["site"] is not None:
             placed.append(found[j].site in one["sites"])
-        if there or one["name"] in ONE_FOR_ALL:
-            covered += list(_intervals(one["parameters"], _together(found, j)))
+        if _of_sensors(one["name"]) not in others:
+            values = _together(found, j)
+            covered += list(_intervals(_said_in(unit, one, values), values))
     return Judgement(
         named, missed, invented, not missed and not invented, right_alike, (sum(placed), len(placed)),
         (sum(covered), len(covered)),
     )  # fmt: skip
+
+
+def _of_sensors(name: str) -> bool:
+    return name.startswith("sensor-")
+
+
+def _others(
+    truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], pairs: Sequence[int | None]
+) -> frozenset[bool]:
+    """Return the sides, sensors (True) or forces, on which another effect or place is named for a true one."""
+    sides: set[bool] = set()
+    for one, j in zip(truth, pairs, strict=True):
+        if j is None or (found[j].name == one["name"] and one["name"] in ONE_FOR_ALL):
+            continue
+        if (found[j].name, found[j].site) != (one["name"], one["site"]):
+            sides |= {_of_sensors(one["name"]), _of_sensors(found[j].name)}
+    return frozenset(sides)
+
+
+def _unit(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], pairs: Sequence[int | None]) -> float:
+    """Return the unit of u in the truth over that of what is found: the true gain of the sensor that is taken as right.
+
+    It is 1 unless one gain of the truth is not found, and those of all other sensors are, or one that does the same.
+    """
+    for one, j in zip(truth, pairs, strict=True):
+        if j is None or not one["name"] == found[j].name == "sensor-gain":
+            continue
+        missing = [value for name, value in one["parameters"].items() if name not in _together(found, j)]
+        if len(missing) == 1 and (len(found[j].values) > 1 or found[j].site in one["sites"]):
+            return float(missing[0])
+    return 1.0
+
+
+def _said_in(unit: float, one: Mapping[str, Any], values: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Return the true parameters of an effect in the unit of u of the values that are found."""
+    true = dict(one["parameters"])
+    if unit != 1 and one["name"] == "sensor-gain":
+        true = {name: true.get(name, 1.0) for name in values}
+    factor = unit ** POWERS.get(one["name"], 0)
+    return {name: value if name == "omega" else value * factor for name, value in true.items()}
 
 
 def _beyond(

@@ -84,6 +84,37 @@ def test_intervals_are_counted_where_the_effect_is_found_at_its_place() -> None:
     assert judge(truth, [said("defect", 1, coefficient=(2.0, float("nan")))]).covered == (0, 0)
 
 
+def test_gains_and_coefficients_are_compared_in_the_unit_of_the_sensor_that_is_taken_as_right() -> None:
+    truth = [there("sensor-gain", None, gain_1=0.5, gain_2=0.8), there("onsite-cubic", None, coefficient=3.0)]
+    truth.append(there("drive", None, cos=2.0, sin=0.0, omega=7.0))
+    # With w = u / 2: the first sensor reads w, the second 1.6 w, the third 2 w; w'' = 12 w^3 + cos(7 t).
+    said_so = [
+        said("sensor-gain", None, gain_2=(1.6, 0.01), gain_3=(2.0, 0.01)),
+        said("onsite-cubic", coefficient=(12.0, 0.1)),
+        said("drive", cos=(1.0, 0.01), sin=(0.0, 0.01), omega=(7.0, 0.01)),
+    ]
+    assert judge(truth, said_so).covered == (6, 6)
+    of_two = {**there("sensor-gain", 1, gain_2=0.5), "sites": [0, 1]}
+    assert judge([of_two], [said("sensor-gain", 0, gain_1=(2.0, 0.01))]).covered == (1, 1)
+    # A sensor that does not do the same has no such unit.
+    assert judge([there("sensor-gain", 1, gain_2=0.5)], [said("sensor-gain", 0, gain_1=(2.0, 0.01))]).covered == (0, 0)
+
+
+def test_where_a_force_does_the_work_of_another_the_sizes_of_forces_are_not_compared() -> None:
+    truth = [there("onsite-cubic", coefficient=1.0), there("onsite-quintic", coefficient=2.0)]
+    truth.append(there("sensor-offset", 0, offset_1=3.0))
+    found = [
+        said("onsite-cubic", coefficient=(4.0, 0.1)), said("onsite-linear", None, ("onsite-quintic",), u=(1.0, 0.1)),
+        said("sensor-offset", 0, offset_1=(3.0, 0.1)),
+    ]  # fmt: skip
+    judged = judge(truth, found)
+    assert judged.right
+    assert judged.covered == (1, 1)
+    # What is missed or invented takes nothing away.
+    assert judge(truth, found[:1]).covered == (0, 1)
+    assert judge(truth, [*found[:1], said("drive")]).covered == (0, 1)
+
+
 def test_values_have_the_names_that_recordings_have_for_them() -> None:
     labels = {
         "offset of u1": 1.0, "gain of u12": 0.5, "curve of u": 2.0, "scale": 3.0, "cos(3.14159*t)": 4.0,
