@@ -80,7 +80,7 @@ class Normal:
 def whitened(followed: Followed, noise: Noise, rows: Rows) -> tuple[Whitener, ndarray, ndarray, ndarray]:
     """Return the whitener, what is left and its derivatives in independent numbers, and the robust weights' roots."""
     seen = np.isfinite(followed.left)
-    whitener = noise.whitener(followed.level, rows, seen)
+    whitener = noise.whitener(followed.swing, rows, seen)
     error = whitener.apply(np.where(seen, followed.left, 0.0))
     robust = whitener.robust(error)
     return whitener, error * robust, whitener.apply(followed.slope) * robust[..., None], robust
@@ -138,6 +138,13 @@ class Curve:
     level: Float[ndarray, "time levels parts sites"]
     field: Float[ndarray, "time order parts sites"]
 
+    @property
+    def swing(self) -> Float[ndarray, "time levels parts sites"]:
+        """The level about its mean, with which noise may grow; NaN where there is no level."""
+        known = np.isfinite(self.level)
+        mean = np.sum(self.level, axis=0, where=known) / np.maximum(np.sum(known, axis=0), 1)
+        return np.asarray(self.level - mean)
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -194,12 +201,12 @@ class Fitted:
         return np.array([np.sqrt(np.nanmean(one)) if np.any(np.isfinite(one)) else np.nan for one in squares])
 
     def has_lines(self) -> bool:
-        """Return whether what is left swings at some frequency, as a misfit does and noise, correlated or not, does not.
+        """Return whether what is left swings at some frequency: a misfit does; noise, correlated or not, does not.
 
         Single outliers count as little as in the fit.
         """
         seen = np.isfinite(self.followed.left)
-        whitener = self.noise.whitener(self.followed.level, self.rows, seen)
+        whitener = self.noise.whitener(self.followed.swing, self.rows, seen)
         error = whitener.apply(np.where(seen, self.followed.left, 0.0))
         for column, read in zip((error * whitener.robust(error)).T, seen.T, strict=True):
             power = np.abs(np.fft.rfft(column[read])[1:]) ** 2
@@ -322,8 +329,8 @@ def _likely(
     followed: Path, rows: Rows, free: ndarray, structure: Structure | None, start: Noise | None
 ) -> tuple[Noise, float]:
     """Return the noise that makes what is left most likely, and the cost."""
-    noise = estimate(followed.left, followed.level, rows, free=free, structure=structure, start=start)
-    return noise, -noise.log_likelihood(followed.left, followed.level, rows)
+    noise = estimate(followed.left, followed.swing, rows, free=free, structure=structure, start=start)
+    return noise, -noise.log_likelihood(followed.left, followed.swing, rows)
 
 
 def _stepped(
@@ -331,7 +338,7 @@ def _stepped(
 ) -> tuple[Followed, float, float] | None:
     """Return where a step leads, the damping of the next and the nats won; None where none promises enough."""
     _, error, slope, _ = whitened(followed, noise, rows)
-    before, size = -noise.log_likelihood(followed.left, followed.level, rows), followed.local
+    before, size = -noise.log_likelihood(followed.left, followed.swing, rows), followed.local
     for _ in range(MOST_FAILURES):
         problem = normal(layout, error, slope, size, damping)
         change = problem.step(damping)
@@ -349,7 +356,7 @@ def _stepped(
         model = followed.model.moved(followed.model.numbers + change)
         trial = follow(model, layout, near, followed.transitions, splines)
         if trial is not None:
-            won = before + noise.log_likelihood(trial.left, trial.level, rows)
+            won = before + noise.log_likelihood(trial.left, trial.swing, rows)
             further = linearised(trial, layout) if won > -1e-6 else None
             if further is not None:
                 return further, max(damping * LESS, 1e-9), won

@@ -7,6 +7,7 @@ closed; Bock, Springer Ser. Chem. Phys. 18, 102 (1981)).
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -221,6 +222,11 @@ class Path:
     def size(self) -> int:
         """The length S of a state."""
         return int(self.nodes[0].shape[-1])
+
+    @functools.cached_property
+    def swing(self) -> Float[ndarray, "rows channels"]:
+        """The model's readings about their mean: noise may grow with that, whatever a sensor's offset."""
+        return np.asarray(self.level - np.mean(self.level, axis=0))
 
 
 @dataclass(frozen=True, eq=False)

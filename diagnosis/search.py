@@ -251,7 +251,7 @@ class Search:
     def _choose_structure(self, fitted: Fitted) -> None:
         """Let the readings choose the parts of the noise model that all models of a horizon share."""
         followed = fitted.followed
-        found = estimate(followed.left, followed.level, fitted.rows).structure
+        found = estimate(followed.left, followed.swing, fitted.rows).structure
         few = len(fitted.rms) <= FEW_SENSORS
         noise = self.problem.noise
         near = bool(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0) < NEAR)

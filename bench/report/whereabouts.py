@@ -66,7 +66,7 @@ def scaled_residuals(fitted: Fitted, diagnosis: Diagnosis) -> list[Trajectory]:
     rest = np.reshape(diagnosis.noise, (-1, 1, diagnosis.after.chain.sites))
     # Of Student's t the standard deviation is larger than the scale, which is what grows.
     growth = noise.growth * float(np.nanmax(noise.deviation() / noise.size))
-    return [(one.t, (one.seen - one.level) / np.hypot(rest, growth * one.level)) for one in fitted.curves()]
+    return [(one.t, (one.seen - one.level) / np.hypot(rest, growth * one.swing)) for one in fitted.curves()]
 
 
 def _innovations(fitted: Fitted, diagnosis: Diagnosis) -> list[Trajectory]:
@@ -85,9 +85,9 @@ def _whitened(
 ) -> Float[ndarray, "time levels parts sites"]:
     rows, levels, parts, sites = curve.seen.shape
     sensor = np.broadcast_to(np.arange(levels * sites).reshape(levels, 1, sites), (levels, parts, sites)).ravel()
-    left, level = (one.reshape(rows, -1) for one in (curve.seen - curve.level, curve.level))
+    left, swing = (one.reshape(rows, -1) for one in (curve.seen - curve.level, curve.swing))
     seen = np.isfinite(left)
-    whitener = noise.whitener(level, Rows(curve.t, np.arange(rows) == 0, sensor), seen)
+    whitener = noise.whitener(swing, Rows(curve.t, np.arange(rows) == 0, sensor), seen)
     z = whitener.apply(left)
     return np.where(seen, z * whitener.robust(z) * unit[sensor], np.nan).reshape(curve.seen.shape)
 
