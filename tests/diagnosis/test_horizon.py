@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
 
 from latticebench.diagnosis.fitting import fit
 from latticebench.diagnosis.horizon import Layout, follow, unread
@@ -120,6 +121,23 @@ def test_a_fit_finds_coefficients_and_the_noise_of_each_sensor():
     assert np.max(found.stderr) < 0.01
     (curve,) = found.curves()
     np.testing.assert_allclose(curve.field[:, :, 0].reshape(len(EVEN), -1), motion(EVEN), atol=0.02)
+
+
+@pytest.mark.parametrize("kind", ["correlated", "outliers"])
+def test_a_misfit_has_lines_in_its_spectrum_and_noise_of_any_kind_has_none(kind):
+    data, draw = recording(EVEN, 0.0, velocities=False), np.random.default_rng(21)
+    white = draw.normal(size=data.u.shape)
+    kinds = {
+        "correlated": 0.6 * lfilter([1.0], [1.0, -0.8], white, axis=0),
+        "outliers": np.where(draw.uniform(size=white.shape) < 0.02, 40 * np.sign(white), white),
+    }
+    problem = Problem.of(DECLARED, 2, [replace(data, u=data.u + 0.01 * kinds[kind])], CATALOGUE)
+    layout = Layout.of(problem, len(EVEN), None, 1e-4)
+    states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
+    structure = Structure(tails=True, memory=True)
+    there = fit(Model(DECLARED, 2, TRUTH), layout, states, structure=structure)
+    assert not there.has_lines()
+    assert fit(Model(DECLARED, 2, (2.0, -2.8)), layout, there.followed.nodes, structure=structure, steps=0).has_lines()
 
 
 def test_the_declared_coefficients_to_start_from_are_near_those_that_made_the_data_whatever_the_sensors_zero():

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 from scipy.signal import lfilter
 
+from latticebench.diagnosis.fitting import spread
 from latticebench.diagnosis.noise import Noise, Rows, Structure, estimate
 
 EVERY_PART = Structure(own_sizes=True, growth=True, tails=True, memory=True)
@@ -131,6 +132,28 @@ def test_the_estimate_is_where_the_likelihood_is_greatest():
         for name in ("size", "growth", "tail", "memory"):
             other = replace(best, **{name: getattr(best, name) * factor})
             assert other.log_likelihood(left, level, rows) < height
+
+
+def test_white_noise_has_no_memory_though_some_readings_nearly_coincide():
+    draw = np.random.default_rng(12)
+    times = np.sort(np.arange(600) + 0.9 * draw.uniform(-1, 1, 600))
+    times[1::50] = times[::50] + 1e-5
+    rows = Rows(times, np.arange(600) == 0, np.arange(1))
+    left, level = draw.normal(size=(600, 1)), np.zeros((600, 1))
+    structure = Structure(memory=True)
+    far = Noise(np.array([12.0]), 0.0, np.inf, np.array([50.0]), structure)
+    for start in (None, far):
+        found = estimate(left, level, rows, structure=structure, start=start)
+        assert found.size[0] == pytest.approx(np.std(left), rel=0.05)
+        assert found.memory[0] < 0.6
+
+
+@pytest.mark.parametrize("tail", [2.7, 4.0, 30.0])
+def test_the_spread_of_a_fit_with_heavy_tails_is_that_of_fishers_information(tail):
+    z = np.random.default_rng(13).standard_t(tail, (200_000, 1))
+    robust = np.sqrt((tail + 1) / (tail + z**2))
+    assert spread(z * robust, robust, tail) == pytest.approx((tail + 3) / (tail + 1), rel=0.03)
+    assert spread(z, np.ones_like(z), np.inf) == 1.0
 
 
 def test_numbers_that_a_fit_took_make_the_noise_larger():
