@@ -201,7 +201,7 @@ class Fitted:
         return np.array([np.sqrt(np.nanmean(one)) if np.any(np.isfinite(one)) else np.nan for one in squares])
 
     def has_lines(self) -> bool:
-        """Return whether what is left swings at some frequency: a misfit does; noise, correlated or not, does not.
+        """Return whether what is left stands or swings at some frequency: a misfit does; noise, correlated or not, not.
 
         Single outliers count as little as in the fit.
         """
@@ -209,7 +209,7 @@ class Fitted:
         whitener = self.noise.whitener(self.followed.swing, self.rows, seen)
         error = whitener.apply(np.where(seen, self.followed.left, 0.0))
         for column, read in zip((error * whitener.robust(error)).T, seen.T, strict=True):
-            power = np.abs(np.fft.rfft(column[read])[1:]) ** 2
+            power = np.abs(np.fft.rfft(column[read])) ** 2
             if len(power) and np.max(power) > LINE * np.mean(power):
                 return True
         return False
