@@ -35,12 +35,10 @@ CLIMBING = 2
 SAME_COST, SAME_READING = 0.3, 0.05
 # An effect is tried without where its own uncertainty leaves less than so many nats beyond its price.
 DOUBT = 8.0
-
 # A candidate may take the place of an effect if it can do this share of what the effect does.
 MOST_OF_IT = 0.9
 # Sensors are tried from the other side on chains of so many sites at most.
 MOST_TURNED = 3
-
 # A misfit grows with the signal, too: noise is taken to do so only where no more than so many times the noise is left.
 NEAR = 2.0
 # On so few sensors each has a size and a correlation of its own whether or not that is plain.
@@ -149,9 +147,12 @@ class Search:
 
         Of correlated noise, and of outliers, readings alone show only a part.
         """
+        return self._beyond(fitted) > rules.LOST and fitted.has_lines()
+
+    def _beyond(self, fitted: Fitted) -> float:
+        """Return how many times the noise that the readings show a model leaves, at the sensor where that is most."""
         noise = self.problem.noise
-        beyond = np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0) > rules.LOST
-        return bool(beyond) and fitted.has_lines()
+        return float(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0))
 
     @property
     def _least(self) -> int:
@@ -253,11 +254,8 @@ class Search:
         followed = fitted.followed
         found = estimate(followed.left, followed.swing, fitted.rows).structure
         few = len(fitted.rms) <= FEW_SENSORS
-        noise = self.problem.noise
-        near = bool(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0) < NEAR)
-        self.structure = replace(
-            found, growth=found.growth and near, own_sizes=found.own_sizes or few, memory=found.memory or few
-        )
+        growth = found.growth and self._beyond(fitted) < NEAR
+        self.structure = replace(found, growth=growth, own_sizes=found.own_sizes or few, memory=found.memory or few)
 
     def _carried(self, last: Found, length: int) -> list[Fitted]:
         """Return the declared equation and the best models on a longer horizon."""
@@ -353,12 +351,26 @@ class Search:
         yield from self._other_side(fitted, pool)
         if len(model.effects) < rules.MOST_EFFECTS:
             timed = ahead == np.inf or not model.effects
-            for one in self.screened(fitted, timed=timed)[: rules.TRIED]:
+            start, likely = self._likely(fitted, timed)
+            for one in likely[: rules.TRIED]:
                 hopeless = here - rules.UNDERSTATED * one.gain + self.problem.price_of(one.placed) > ahead
                 if not hopeless and model.with_effect(one.placed).key not in pool:
-                    found = self.with_effect(fitted, one.placed)
+                    found = self.with_effect(start, one.placed)
                     if found is not None and self.value(found) < here:
                         yield found
+
+    def _likely(self, fitted: Fitted, timed: bool) -> tuple[Fitted, list[Scored]]:
+        """Return the candidates whose score is above their price, and the fit that this is so for.
+
+        Noise with a long memory does the work of slow forces: where it leaves no candidate, it is taken as white.
+        """
+        found = self.screened(fitted, timed=timed)
+        if found or np.max(fitted.noise.memory) < self.problem.step:
+            return fitted, found
+        tried = self.tried[fitted.model.key]
+        white = replace(fitted, noise=replace(fitted.noise, memory=0 * fitted.noise.memory))
+        found, self.tried[fitted.model.key] = self.screened(white, timed=timed), tried
+        return white, found
 
     def _exchanged(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
         """Yield models with a likelier effect in the place of one."""
