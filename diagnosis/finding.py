@@ -9,6 +9,7 @@ from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.search import Search, wald
+from latticebench.diagnosis.worth import Worth
 
 # An alternative that comes to no less than so many nats behind the effect is given up.
 HOPE = 30.0
@@ -61,6 +62,7 @@ class Compared:
 
 def compared(search: Search, fitted: Fitted) -> Compared:
     """Try a model without each of its effects, and with others in its place; a better model takes its place."""
+    search.worth = Worth(search.problem, fitted)
     for _ in range(2 * rules.MOST_EFFECTS):
         better, evidence, alternatives = None, [], []
         for number in range(len(fitted.model.effects)):
@@ -94,13 +96,13 @@ class _Exchange:
 def _exchanged(search: Search, fitted: Fitted, number: int) -> _Exchange:
     placed = fitted.model.effects[number]
     without = search.without(fitted, number)
-    evidence = wald(fitted, number) if without is None else without.cost - fitted.cost
+    evidence = wald(fitted, number) if without is None else (without.cost - fitted.cost) / fitted.dispersion
     models, equal = [] if without is None else [without], []
     for found in _rivals(search, fitted, without, number, evidence):
         models.append(found)
         name = found.model.effects[-1].effect.name
         more = len(found.model.numbers) - len(fitted.model.numbers)
-        if found.cost + more < fitted.cost + rules.EQUAL and name != placed.effect.name:
+        if found.cost + more < fitted.cost + rules.EQUAL * fitted.dispersion and name != placed.effect.name:
             equal.append(name)
     return _Exchange(float(evidence), tuple(models), tuple(dict.fromkeys(equal)))
 
@@ -110,7 +112,7 @@ def _rivals(search: Search, fitted: Fitted, without: Fitted | None, number: int,
     placed, names = fitted.model.effects[number], set()
     for one in search.standing_in(fitted, number)[:MOST_ALTERNATIVES]:
         names.add(one.placed.effect.name)
-        hope = fitted.cost + HOPE
+        hope = fitted.cost + HOPE * fitted.dispersion
         found = search.exchanged(fitted, number, one.placed, hope)
         if found is None:
             found = search.climbed(fitted.model.without(number).with_effect(one.placed), fitted, hope)
@@ -120,7 +122,7 @@ def _rivals(search: Search, fitted: Fitted, without: Fitted | None, number: int,
         return
     for one in search.screened(without, timed=placed.timed):
         name = one.placed.effect.name
-        enough = one.gain > COMPARABLE * evidence
+        enough = one.gain / fitted.dispersion > COMPARABLE * evidence
         if name not in names and enough and len(names) < MOST_ALTERNATIVES and one.placed.place != placed.place:
             names.add(name)
             found = search.with_effect(without, one.placed)

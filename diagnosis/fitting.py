@@ -6,12 +6,14 @@ The initial state of each piece is eliminated from the normal equations piece by
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain
 from latticebench.diagnosis.horizon import Followed, Layout, Path, fields, follow, linearised
 from latticebench.diagnosis.model import Model
@@ -31,6 +33,10 @@ DAMPING, MORE, LESS, MOST_FAILURES = 1e-6, 30.0, 0.1, 5
 LINE = 20.0
 # Directions of the numbers that the readings do not determine, as a share of the best determined one.
 UNDETERMINED = 1e-9
+# From so many pieces on a stretch is one of them or several: each has lost what its own initial state can do.
+FEW_PIECES = 8
+# How many standard deviations of chance are taken off the spread of a model's numbers between stretches.
+CHANCE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +73,40 @@ class Normal:
         """Return the covariance of the numbers; vast where the readings do not determine them."""
         scale, values, vectors = self._scaled
         return np.asarray((vectors / np.maximum(values, 1e-3 * UNDETERMINED)) @ vectors.T / scale / scale[:, None])
+
+    def dispersion(self) -> float:
+        """Return how many times as much as noise lets them the numbers vary between stretches, at least 1.
+
+        The slope of the likelihood by the numbers vanishes for a recording as a whole. Of each of `rules.STRETCHES`
+        stretches it is what noise makes it, if the model is right: the sum of s H^-1 s, where H is the information of
+        all, is then a chi-squared variable. What is left of a model that is not quite right is smooth, and holds fewer
+        independent numbers than there are readings: likelihood ratios are too large by this factor (the dispersion of
+        a quasi-likelihood, Wedderburn, Biometrika 61, 439 (1974), from the score's variance over blocks, White,
+        Econometrica 50, 1 (1982)). What chance alone makes is taken off.
+        """
+        scale, values, vectors = self._scaled
+        held = values > UNDETERMINED
+        root = vectors[:, held] / np.sqrt(values[held]) / scale[:, None]
+        size = self.inner[0].shape[1]
+        own, left, ends = [], [], [0]
+        pieces = sum(len(one) for one in self.error)
+        for error, slope, inner in zip(self.error, self.slope, self.inner, strict=True):
+            local = slope[:, :, :size]
+            own.append(((slope[:, :, size:] - local @ inner[:, :, :-1]) @ root).reshape(-1, root.shape[1]))
+            left.append((error - (local @ inner[:, :, -1:])[..., 0]).ravel())
+            each = error.shape[1] if pieces >= FEW_PIECES else 1
+            ends += (ends[-1] + each * np.arange(1, error.size // each + 1)).tolist()
+        columns, rest = np.concatenate(own), np.concatenate(left)
+        total, freedom = 0.0, float(root.shape[1])
+        whole = columns.T @ rest
+        bounds = np.array(ends)[np.linspace(0, len(ends) - 1, min(rules.STRETCHES, len(ends) - 1) + 1).astype(int)]
+        for begin, end in itertools.pairwise(bounds):
+            part = columns[begin:end]
+            gram = part.T @ part
+            total += float(np.sum((part.T @ rest[begin:end] - gram @ whole) ** 2))
+            freedom -= float(np.sum(gram**2))
+        likely = freedom + CHANCE * np.sqrt(2 * max(freedom, 0.0))
+        return max(1.0, total / likely) if np.isfinite(total) and likely > 0 else 1.0
 
     def promised(self, change: Float[ndarray, " numbers"]) -> float:
         """Return how many nats a step wins as far as the problem is linear."""
@@ -155,7 +195,8 @@ class Fitted:
         followed: the model along them.
         noise: of every sensor.
         cost: minus the logarithm of the likelihood, in nats.
-        covariance: of the model's numbers.
+        covariance: of the model's numbers, with what the model misfits.
+        dispersion: by how much likelihood ratios are too large, as what is left is no noise; see `Normal.dispersion`.
         converged: whether the steps came to an end.
         rows: times and sensors of the readings.
     """
@@ -165,6 +206,7 @@ class Fitted:
     noise: Noise
     cost: float
     covariance: Float[ndarray, "numbers numbers"]
+    dispersion: float
     converged: bool
     rows: Rows
 
@@ -280,8 +322,10 @@ def fit(
     if cost > hope:
         return None
     _, error, slope, robust = whitened(followed, noise, rows)
-    covariance = normal(layout, error, slope, followed.local, 0.0).covariance() * spread(error, robust, noise.tail)
-    return Fitted(layout, followed, noise, cost, covariance, converged, rows)
+    solved = normal(layout, error, slope, followed.local, 0.0)
+    dispersion = solved.dispersion()
+    covariance = solved.covariance() * spread(error, robust, noise.tail) * dispersion
+    return Fitted(layout, followed, noise, cost, covariance, dispersion, converged, rows)
 
 
 def spread(error: ndarray, robust: ndarray, tail: float) -> float:

@@ -273,13 +273,22 @@ def thinned(samples: Samples, top: float) -> Samples:
 
 
 def windows(samples: Samples) -> list[Samples]:
-    """Return evenly spaced windows of a recording that is too long to be used as a whole."""
+    """Return windows of a recording that is too long to be used as a whole, where its signal is.
+
+    Each is the middle of an equal share of the readings' sum of squares: little is learned where little moves.
+    """
     count = len(samples.t)
     if count <= LONG:
         return [samples]
     size = LONG // WINDOWS
+    squares = np.nansum(np.abs(samples.u - np.nanmean(samples.u, axis=0)) ** 2, axis=1)
+    middles = np.searchsorted(np.cumsum(squares), (np.arange(WINDOWS) + 0.5) / WINDOWS * np.sum(squares))
+    # None overlap.
+    least = np.arange(WINDOWS) * size
+    begins = least + np.maximum.accumulate(np.maximum(middles - size // 2 - least, 0))
+    begins = np.minimum(begins, count - size * np.arange(WINDOWS, 0, -1))
     found = []
-    for begin in np.linspace(0, count - size, WINDOWS).round().astype(int):
+    for begin in begins:
         rows = slice(begin, begin + size)
         v, f = (None if one is None else one[rows] for one in (samples.v, samples.f))
         found.append(replace(samples, t=samples.t[rows], u=samples.u[rows], v=v, f=f))

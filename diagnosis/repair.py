@@ -20,6 +20,7 @@ from latticebench.diagnosis.modes import Mode
 from latticebench.diagnosis.problem import Problem, derivative_share
 from latticebench.diagnosis.search import Found, Horizon, Search, Watcher
 from latticebench.diagnosis.unnamed import Left, left_in
+from latticebench.diagnosis.worth import lost
 from latticebench.methods.method import check_fit
 from latticebench.systems.effects import Effect
 from latticebench.systems.errors import InputError
@@ -151,7 +152,7 @@ def diagnose(
         try:
             for step in search.horizons():
                 # A model that loses the readings over longer pieces is judged by those that it can follow.
-                if found is None or not search.lost(step.models[0]) or search.lost(found.models[0]):
+                if found is None or not lost(problem, step.models[0]) or lost(problem, found.models[0]):
                     found = step
             if found is None:
                 raise InputError(f"{shown[0].source}: the declared equation cannot be followed even over a few samples")

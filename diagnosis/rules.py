@@ -13,6 +13,9 @@ FALSE_DOUBT = 0.005
 LOCKED = 10.0
 # Effects that feed readings back into the motion: what they bring is such an influence, too.
 FED = frozenset({"memory"})
+# Stretches of the recordings whose numbers are compared: where they differ by more than the noise lets them, all
+# evidence is that much less. Twice as many can hold twice the evidence of what is no noise; a few periods must fit in.
+STRETCHES = 32
 # Models that are carried to the next horizon, and how many nats they may be behind the best one.
 RIVALS, BEHIND = 3, 60.0
 # Candidates of each model that are fitted in full, those of the highest score first.
@@ -37,6 +40,10 @@ GROWTH, FASTER, ALMOST = 2, 4, 0.6
 BORDER = 16.0
 # A residual beyond so many times the noise that the readings themselves show is not followed.
 LOST = 3.0
+# Where even what is new from one reading to the next is beyond it, what is left is not noise, and nats say little: an
+# effect counts that takes this share of what is left away (of its root mean square), an influence with a frequency or
+# a time of its own one that takes half of it: a misfit swings as the motion does.
+SHARE, SHARE_TIMED = 0.1, 0.5
 # Nats that a chain costs in which neighbours push each other away. In a linear chain of two it is the mirror image of
 # one whose second sensor looks from the other side; of the two, that is what laboratories have.
 REPELLING = 30.0

@@ -20,6 +20,7 @@ from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure, estimate
 from latticebench.diagnosis.problem import Problem, regressed, turned
 from latticebench.diagnosis.score import Scored, Tangent
+from latticebench.diagnosis.worth import COUPLING, Worth, beyond, misfits, repelling
 
 Watcher = Callable[[str], None]
 
@@ -43,8 +44,6 @@ MOST_TURNED = 3
 NEAR = 2.0
 # On so few sensors each has a size and a correlation of its own whether or not that is plain.
 FEW_SENSORS = 8
-
-COUPLING = "u[n+1]+u[n-1]-2*u[n]"
 
 Pool = dict[tuple[str, ...], Fitted]
 
@@ -100,21 +99,12 @@ class Search:
         self.tried: dict[tuple[str, ...], tuple[Tried, ...]] = {}
         self.open: tuple[Placed, ...] = problem.candidates
         self.lengths: list[int] = []
+        self.worth = Worth(problem)
         self._last: Tangent | None = None
 
     def value(self, fitted: Fitted) -> float:
         """Return the cost of a fit with the prices of its effects and of the noise's parameters, in nats."""
-        model = fitted.model
-        price = sum(self.problem.price_of(one) for one in model.effects)
-        noise = fitted.noise.parameters / 2 * np.log(max(fitted.layout.readings(), 2))
-        return fitted.cost + price + float(noise) + self._repelling(model)
-
-    def _repelling(self, model: Model) -> float:
-        """Return what a chain costs whose neighbours push each other away: a sensor that looks from the other side."""
-        if self.problem.chain.is_complex or model.order != 2 or self.problem.chain.sites == 1:
-            return 0.0
-        pairs = zip(model.declared.texts, model.coefficients, strict=True)
-        return rules.REPELLING if any(text == COUPLING and value < 0 for text, value in pairs) else 0.0
+        return self.worth.value(fitted)
 
     def horizons(self) -> Iterator[Found]:
         """Yield what was found on each horizon, from short pieces to whole recordings."""
@@ -126,7 +116,7 @@ class Search:
             self.lengths.append(length)
             whole = length >= self._longest
             waves = length * self.problem.step * self.problem.main / (2 * np.pi)
-            late = whole or waves >= rules.PERIODS or (last is not None and self.lost(last.models[0]))
+            late = whole or waves >= rules.PERIODS or (last is not None and misfits(self.problem, last.models[0]))
             self.open = tuple(one for one in self.problem.candidates if late or not one.timed)
             carried = self._first(length) if last is None else self._carried(last, length)
             if not carried:
@@ -141,18 +131,6 @@ class Search:
             last = Found(before, tuple(best), done)
             yield last
             length = self._next(length, settled)
-
-    def lost(self, fitted: Fitted) -> bool:
-        """Return whether a model leaves much more of the readings than their own noise, and more than noise.
-
-        Of correlated noise, and of outliers, readings alone show only a part.
-        """
-        return self._beyond(fitted) > rules.LOST and fitted.has_lines()
-
-    def _beyond(self, fitted: Fitted) -> float:
-        """Return how many times the noise that the readings show a model leaves, at the sensor where that is most."""
-        noise = self.problem.noise
-        return float(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0))
 
     @property
     def _least(self) -> int:
@@ -205,12 +183,12 @@ class Search:
     def _mirrored(self, start: Model) -> list[tuple[Model, Problem]]:
         """Return the declared equation with one sensor that looks from the other side, and the states it then has."""
         found = []
-        for one in self._sensors() if self._repelling(start) else ():
+        for one in self._sensors() if repelling(self.problem, start) else ():
             other = one.turned()
             if other is not None and one.site is not None:
                 seen = turned(self.problem, one.site)
                 model = replace(start, coefficients=regressed(seen))
-                if not self._repelling(model):
+                if not repelling(self.problem, model):
                     found.append((model.with_effect(other), seen))
         return found
 
@@ -226,7 +204,7 @@ class Search:
         With w = -u of the second site, C (w - u) + k u is -C (u2 - u) + (k + 2 C) u of the first, and the like.
         """
         texts = list(fitted.model.declared.texts)
-        if self.problem.chain.sites != 2 or not self._repelling(fitted.model) or "u[n]" not in texts:
+        if self.problem.chain.sites != 2 or not repelling(self.problem, fitted.model) or "u[n]" not in texts:
             return
         coefficients = list(fitted.model.coefficients)
         pull, own = texts.index(COUPLING), texts.index("u[n]")
@@ -254,7 +232,7 @@ class Search:
         followed = fitted.followed
         found = estimate(followed.left, followed.swing, fitted.rows).structure
         few = len(fitted.rms) <= FEW_SENSORS
-        growth = found.growth and self._beyond(fitted) < NEAR
+        growth = found.growth and beyond(self.problem, fitted) < NEAR
         self.structure = replace(found, growth=growth, own_sizes=found.own_sizes or few, memory=found.memory or few)
 
     def _carried(self, last: Found, length: int) -> list[Fitted]:
@@ -305,6 +283,7 @@ class Search:
     def _level(self, fits: list[Fitted], before: Fitted) -> list[Fitted]:
         """Return the best models of a horizon, where the declared equation alone leads to `before`."""
         pool: Pool = {}
+        self.worth = Worth(self.problem, min(fits, key=lambda one: one.cost))
         for one in fits:
             self._keep(pool, one)
         opened: set[tuple[str, ...]] = set()
@@ -322,6 +301,7 @@ class Search:
         key = one.model.key
         if key not in pool or self.value(one) < self.value(pool[key]):
             pool[key] = one
+            self.worth = Worth(self.problem, min(pool.values(), key=lambda kept: kept.cost))
 
     def _leading(self, pool: Pool) -> list[Fitted]:
         """Return the best models that differ in what they say of the readings."""
@@ -339,11 +319,11 @@ class Search:
 
         A rival's candidate is fitted where its score could bring the rival to the front, past the value `ahead`.
         """
-        here = self.value(fitted)
+        here, own = self.value(fitted), Worth(self.problem, fitted)
         model = fitted.model
         for number in range(len(model.effects)):
             if model.without(number).key not in pool and not self._sure(fitted, number):
-                hope = fitted.cost + self.problem.price_of(model.effects[number])
+                hope = fitted.cost + fitted.dispersion * own.price_of(model.effects[number])
                 found = self.without(fitted, number, hope)
                 if found is not None:
                     yield found
@@ -353,10 +333,11 @@ class Search:
             timed = ahead == np.inf or not model.effects
             start, likely = self._likely(fitted, timed)
             for one in likely[: rules.TRIED]:
-                hopeless = here - rules.UNDERSTATED * one.gain + self.problem.price_of(one.placed) > ahead
+                gain = rules.UNDERSTATED * one.gain / fitted.dispersion
+                hopeless = here - gain + own.price_of(one.placed) > ahead
                 if not hopeless and model.with_effect(one.placed).key not in pool:
                     found = self.with_effect(start, one.placed)
-                    if found is not None and self.value(found) < here:
+                    if found is not None and Worth(self.problem, found).better(found, fitted):
                         yield found
 
     def _likely(self, fitted: Fitted, timed: bool) -> tuple[Fitted, list[Scored]]:
@@ -392,7 +373,7 @@ class Search:
         """Return whether an effect is beyond doubt by its numbers and their covariance."""
         if not fitted.model.effects[number].strength:
             return False
-        return wald(fitted, number) > self.problem.price_of(fitted.model.effects[number]) + DOUBT
+        return wald(fitted, number) > Worth(self.problem, fitted).price_of(fitted.model.effects[number]) + DOUBT
 
     def without(self, fitted: Fitted, number: int, hope: float = np.inf) -> Fitted | None:
         """Return the fit without one effect; None where it comes to no cost below `hope`."""
@@ -455,7 +436,7 @@ class Search:
         """Return the candidates whose score is above their price, the best first."""
         present = {one.place for one in fitted.model.effects if not one.timed}
         absent = [one for one in self.open if one.place not in present and not one.timed]
-        tangent = self._tangent(fitted)
+        tangent, own = self._tangent(fitted), Worth(self.problem, fitted)
         if timed:
             courses = [one for one in self.open if one.timed]
             absent += tangent.likeliest(courses, self.problem.price_of, lambda one: one.effect.name)
@@ -467,7 +448,8 @@ class Search:
             if name not in tried or one.gain - price > tried[name].gain - tried[name].price:
                 tried[name] = Tried(name, one.gain, price)
             key = one.placed.place
-            if one.freedom and one.gain > price and (key not in best or one.gain - price > best[key][0]):
+            least = max(price, own.price_of(one.placed) * fitted.dispersion / rules.UNDERSTATED)
+            if one.freedom and one.gain > least and (key not in best or one.gain - price > best[key][0]):
                 best[key] = (one.gain - price, one)
         self.tried[fitted.model.key] = tuple(sorted(tried.values(), key=lambda one: one.price - one.gain))
         return [one for _, one in sorted(best.values(), key=lambda pair: -pair[0])]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -119,6 +120,7 @@ def test_a_fit_finds_coefficients_and_the_noise_of_each_sensor():
     np.testing.assert_allclose(found.rms, sizes, rtol=0.15)
     assert np.max(np.abs((found.model.numbers - TRUTH) / found.stderr)) < 4
     assert np.max(found.stderr) < 0.01
+    assert found.dispersion == 1.0
     (curve,) = found.curves()
     np.testing.assert_allclose(curve.field[:, :, 0].reshape(len(EVEN), -1), motion(EVEN), atol=0.02)
 
@@ -140,6 +142,33 @@ def test_a_misfit_has_lines_in_its_spectrum_and_noise_of_any_kind_has_none(kind)
     assert fit(Model(DECLARED, 2, (2.0, -2.8)), layout, there.followed.nodes, structure=structure, steps=0).has_lines()
 
 
+def test_evidence_counts_as_much_less_as_the_numbers_differ_between_stretches_of_a_recording():
+    t = np.linspace(0, 60, 1200)
+    problem = Problem.of(DECLARED, 2, [recording(t, 1e-4)], CATALOGUE)
+    small_swings = library("linear", "u[n+1]+u[n-1]-2*u[n]; u[n]")
+    layout = Layout.of(problem, 100, None, 1e-6)
+    states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
+    right, wrong = (
+        fit(
+            Model(one, 2, TRUTH),
+            replace(layout, plain=replace(layout.plain, terms=one.terms)),
+            states,
+            structure=Structure(),
+        )
+        for one in (DECLARED, small_swings)
+    )
+    assert right.dispersion == 1.0
+    assert wrong.dispersion > 5
+    differ = [
+        fit(wrong.model, replace(wrong.layout, rows=(rows,), valid=(valid,)), [states[0][part]], structure=Structure())
+        for part in np.array_split(np.arange(len(states[0])), 4)
+        for rows, valid in [(layout.rows[0][part], layout.valid[0][part])]
+    ]
+    scatter = np.std([one.model.numbers for one in differ], axis=0, ddof=1)
+    assert np.all(scatter / 2 < 4 * wrong.stderr)
+    assert np.any(scatter / 2 > 2 * wrong.stderr / np.sqrt(wrong.dispersion))
+
+
 def test_the_declared_coefficients_to_start_from_are_near_those_that_made_the_data_whatever_the_sensors_zero():
     data = recording(EVEN, 0.003)
     for offset in (0.0, 0.5):
@@ -158,7 +187,17 @@ def test_a_long_recording_is_used_thinned_and_in_windows():
     parts = windows(thin)
     assert len(parts) == WINDOWS
     assert sum(len(one.t) for one in parts) <= LONG
-    assert (parts[0].t[0], parts[-1].t[-1]) == (thin.t[0], thin.t[-1])
+    assert all(one.t[-1] < other.t[0] for one, other in itertools.pairwise(parts))
+
+
+@pytest.mark.parametrize("middle", [0.0, 0.3, 1.0])
+def test_windows_of_a_long_recording_lie_where_its_signal_is(middle):
+    t = np.linspace(0, 1, 10 * LONG)
+    signal = np.exp(-(((t - middle) / 0.01) ** 2)) * np.sin(2e4 * t)
+    parts = windows(Samples(t, signal[:, None], source="long", ends="free"))
+    assert all(one.t[-1] < other.t[0] for one, other in itertools.pairwise(parts))
+    assert sum(np.sum(one.u**2) for one in parts) > 0.9 * np.sum(signal**2)
+    assert {len(one.t) for one in parts} == {LONG // WINDOWS}
 
 
 def test_with_a_slow_clock_positions_go_faster_than_velocities_say():

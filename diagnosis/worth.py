@@ -1,0 +1,86 @@
+"""What a model is worth: its cost, the price of what it has, and what it misfits."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.acting import Placed
+from latticebench.diagnosis.fitting import Fitted
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.problem import Problem
+
+COUPLING = "u[n+1]+u[n-1]-2*u[n]"
+
+
+def beyond(problem: Problem, fitted: Fitted) -> float:
+    """Return how many times the noise that the readings show a model leaves, at the sensor where that is most."""
+    noise = problem.noise
+    return float(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0))
+
+
+def lost(problem: Problem, fitted: Fitted) -> bool:
+    """Return whether a model leaves much more of the readings than their own noise, and more than noise.
+
+    Of correlated noise, and of outliers, readings alone show only a part.
+    """
+    return beyond(problem, fitted) > rules.LOST and fitted.has_lines()
+
+
+def misfits(problem: Problem, fitted: Fitted) -> bool:
+    """Return whether even what is new from one reading to the next swings, and is much more than noise at all sensors."""
+    noise = fitted.noise
+    time = np.where(noise.memory > 0, noise.memory, 1e-9 * problem.step)
+    new = noise.size * np.sqrt(-np.expm1(-2 * problem.step / time))
+    known = problem.noise > 0
+    large = np.any(known) and np.all(new[known] > rules.LOST * problem.noise[known])
+    return bool(large) and fitted.has_lines()
+
+
+def repelling(problem: Problem, model: Model) -> float:
+    """Return what a chain costs whose neighbours push each other away: a sensor that looks from the other side."""
+    if problem.chain.is_complex or model.order != 2 or problem.chain.sites == 1:
+        return 0.0
+    pairs = zip(model.declared.texts, model.coefficients, strict=True)
+    return rules.REPELLING if any(text == COUPLING and value < 0 for text, value in pairs) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Worth:
+    """What models are worth beside the best of them, whose misfit says how much evidence counts.
+
+    Attributes:
+        problem: the recordings.
+        best: the fit of least cost; none of a search that has not begun.
+    """
+
+    problem: Problem
+    best: Fitted | None = None
+
+    @functools.cached_property
+    def least(self) -> tuple[float, float]:
+        """Nats that an effect must bring at least, and an influence with a frequency or a time of its own."""
+        if self.best is None or not misfits(self.problem, self.best):
+            return 0.0, 0.0
+        readings = self.best.layout.readings() / self.best.dispersion
+        return -float(np.log1p(-rules.SHARE)) * readings, -float(np.log1p(-rules.SHARE_TIMED)) * readings
+
+    def price_of(self, placed: Placed) -> float:
+        """Return the nats that an effect must bring."""
+        return max(self.problem.price_of(placed), self.least[placed.timed])
+
+    def price(self, fitted: Fitted) -> float:
+        """Return the price of a model: of its effects and of the noise's parameters."""
+        noise = fitted.noise.parameters / 2 * np.log(max(fitted.layout.readings(), 2))
+        return sum(map(self.price_of, fitted.model.effects)) + float(noise) + repelling(self.problem, fitted.model)
+
+    def value(self, fitted: Fitted) -> float:
+        """Return the cost of a fit, as much less as the best one misfits, and its price, in nats."""
+        return fitted.cost / (1.0 if self.best is None else self.best.dispersion) + self.price(fitted)
+
+    def better(self, found: Fitted, fitted: Fitted) -> bool:
+        """Return whether one model is better than another."""
+        return self.value(found) < self.value(fitted)
