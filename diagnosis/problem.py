@@ -233,13 +233,13 @@ class Problem:
         return any(step**2 / 12 > ROUNDED * size**2 for step, size in pairs)
 
     def locked(self, placed: Placed) -> float:
-        """Return what an influence costs besides that swings as the motion itself does."""
+        """Return what an influence costs besides that swings as the motion itself does, or a measured input may."""
         if placed.effect.name in rules.FED:
             return rules.LOCKED
         omega = placed.frequency
         if omega is None:
             return 0.0
-        if self._rounded:
+        if self._rounded or self.scene.inputs:
             return rules.LOCKED
         width = 4 * np.pi / float(self.data[0].t[-1] - self.data[0].t[0])
         own = self.spectrum.peaks[:4]

@@ -9,7 +9,8 @@ FALSE_ALARM = 0.005
 # Chance that such a diagnosis finds something without a name.
 FALSE_DOUBT = 0.005
 # Nats besides for an influence that swings at a frequency of the motion itself, a multiple or a sum: a wrong equation
-# leaves just that. Where rounding makes the noise, it leaves lines at any frequency.
+# leaves just that. Where rounding makes the noise, it leaves lines at any frequency; a wrong equation that an input
+# drives leaves lines wherever the input has some.
 LOCKED = 10.0
 # Effects that feed readings back into the motion: what they bring is such an influence, too.
 FED = frozenset({"memory"})
@@ -41,8 +42,8 @@ BORDER = 16.0
 # A residual beyond so many times the noise that the readings themselves show is not followed.
 LOST = 3.0
 # Where even what is new from one reading to the next is beyond it, what is left is not noise, and nats say little: an
-# effect counts that takes this share of what is left away (of its root mean square), an influence with a frequency or
-# a time of its own one that takes half of it: a misfit swings as the motion does.
+# effect counts if it takes away this share of what is left (of its root mean square), an influence with a frequency or
+# a time of its own if it takes half of it: a misfit swings as the motion does.
 SHARE, SHARE_TIMED = 0.1, 0.5
 # Nats that a chain costs in which neighbours push each other away. In a linear chain of two it is the mirror image of
 # one whose second sensor looks from the other side; of the two, that is what laboratories have.

@@ -31,7 +31,7 @@ def lost(problem: Problem, fitted: Fitted) -> bool:
 
 
 def misfits(problem: Problem, fitted: Fitted) -> bool:
-    """Return whether even what is new from one reading to the next swings, and is much more than noise at all sensors."""
+    """Return whether even what is new from one reading to the next swings, and is far beyond noise at all sensors."""
     noise = fitted.noise
     time = np.where(noise.memory > 0, noise.memory, 1e-9 * problem.step)
     new = noise.size * np.sqrt(-np.expm1(-2 * problem.step / time))
