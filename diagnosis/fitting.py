@@ -106,7 +106,7 @@ class Normal:
             total += float(np.sum((part.T @ rest[begin:end] - gram @ whole) ** 2))
             freedom -= float(np.sum(gram**2))
         likely = freedom + CHANCE * np.sqrt(2 * max(freedom, 0.0))
-        return max(1.0, total / likely) if np.isfinite(total) and likely > 0 else 1.0
+        return max(1.0, float(total / likely)) if np.isfinite(total) and likely > 0 else 1.0
 
     def promised(self, change: Float[ndarray, " numbers"]) -> float:
         """Return how many nats a step wins as far as the problem is linear."""

@@ -10,11 +10,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.fitting import fit
 from latticebench.diagnosis.horizon import Layout, follow, unread
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
 from latticebench.diagnosis.problem import LONG, WINDOWS, Problem, regressed, thinned, windows
+from latticebench.diagnosis.worth import Worth, misfits
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -125,6 +127,19 @@ def test_a_fit_finds_coefficients_and_the_noise_of_each_sensor():
     np.testing.assert_allclose(curve.field[:, :, 0].reshape(len(EVEN), -1), motion(EVEN), atol=0.02)
 
 
+@pytest.fixture(scope="module")
+def right_and_wrong():
+    """Fits of the declared equation, and of one for small swings, to the same pieces of nearly exact readings."""
+    t = np.linspace(0, 60, 1200)
+    found = []
+    for one in (DECLARED, library("small swings", "u[n+1]+u[n-1]-2*u[n]; u[n]")):
+        problem = Problem.of(one, 2, [recording(t, 2e-4, velocities=False)], CATALOGUE)
+        layout = Layout.of(problem, 40, None, 2e-6)
+        states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
+        found.append((problem, fit(Model(one, 2, regressed(problem)), layout, states, structure=Structure())))
+    return found
+
+
 @pytest.mark.parametrize("kind", ["correlated", "outliers"])
 def test_a_misfit_has_lines_in_its_spectrum_and_noise_of_any_kind_has_none(kind):
     data, draw = recording(EVEN, 0.0, velocities=False), np.random.default_rng(21)
@@ -142,31 +157,34 @@ def test_a_misfit_has_lines_in_its_spectrum_and_noise_of_any_kind_has_none(kind)
     assert fit(Model(DECLARED, 2, (2.0, -2.8)), layout, there.followed.nodes, structure=structure, steps=0).has_lines()
 
 
-def test_evidence_counts_as_much_less_as_the_numbers_differ_between_stretches_of_a_recording():
-    t = np.linspace(0, 60, 1200)
-    problem = Problem.of(DECLARED, 2, [recording(t, 1e-4)], CATALOGUE)
-    small_swings = library("linear", "u[n+1]+u[n-1]-2*u[n]; u[n]")
-    layout = Layout.of(problem, 100, None, 1e-6)
-    states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
-    right, wrong = (
-        fit(
-            Model(one, 2, TRUTH),
-            replace(layout, plain=replace(layout.plain, terms=one.terms)),
-            states,
-            structure=Structure(),
-        )
-        for one in (DECLARED, small_swings)
-    )
+def test_evidence_counts_as_much_less_as_the_numbers_differ_between_stretches_of_a_recording(right_and_wrong):
+    (_, right), (_, wrong) = right_and_wrong
     assert right.dispersion == 1.0
-    assert wrong.dispersion > 5
-    differ = [
-        fit(wrong.model, replace(wrong.layout, rows=(rows,), valid=(valid,)), [states[0][part]], structure=Structure())
-        for part in np.array_split(np.arange(len(states[0])), 4)
-        for rows, valid in [(layout.rows[0][part], layout.valid[0][part])]
+    assert wrong.dispersion > 3
+    pieces = np.array_split(np.arange(len(wrong.followed.nodes[0])), 6)
+    layouts = [
+        replace(wrong.layout, rows=(wrong.layout.rows[0][part],), valid=(wrong.layout.valid[0][part],))
+        for part in pieces
     ]
-    scatter = np.std([one.model.numbers for one in differ], axis=0, ddof=1)
-    assert np.all(scatter / 2 < 4 * wrong.stderr)
-    assert np.any(scatter / 2 > 2 * wrong.stderr / np.sqrt(wrong.dispersion))
+    numbers = [
+        fit(wrong.model, replace(one, substeps=(np.ones(part.size * (one.longest - 1), dtype=int),)),
+            [wrong.followed.nodes[0][part]], structure=Structure()).model.numbers
+        for one, part in zip(layouts, pieces, strict=True)
+    ]  # fmt: skip
+    scatter = np.std(numbers, axis=0, ddof=1) / np.sqrt(len(pieces))
+    assert np.all(scatter < 3 * wrong.stderr)
+    assert np.max(scatter / wrong.stderr * np.sqrt(wrong.dispersion)) > 2
+
+
+def test_of_a_model_that_misfits_an_effect_must_take_a_share_of_what_is_left(right_and_wrong):
+    (problem, right), (same, wrong) = right_and_wrong
+    assert not misfits(problem, right)
+    assert misfits(same, wrong)
+    for one in (problem.candidates[0], next(one for one in problem.candidates if one.timed)):
+        assert Worth(problem, right).price_of(one) == problem.price_of(one)
+        share = rules.SHARE_TIMED if one.timed else rules.SHARE
+        least = 1200 * SITES * -np.log(1 - share) / wrong.dispersion
+        assert Worth(same, wrong).price_of(one) == pytest.approx(max(least, problem.price_of(one)))
 
 
 def test_the_declared_coefficients_to_start_from_are_near_those_that_made_the_data_whatever_the_sensors_zero():
