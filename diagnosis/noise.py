@@ -42,7 +42,7 @@ LIGHTEST = 1000.0
 MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
 # Readings closer than this share of the typical interval correlate as over that: part of any noise is white, and of
 # white noise two readings at nearly the same time differ as any others.
-CLOSE = 0.25
+CLOSE = 0.2
 # What is left between strongly correlated readings must not be divided by zero.
 CLOSEST = 1e-4
 # Nats that each part of the structure must win beyond Schwarz' penalty. Four parts are tried, on records of less than a
