@@ -27,14 +27,14 @@ class Gain(OfSensors, acts="gain"):
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every site, and all but the first at once: what the first one reads is the unit."""
+        """Return every site, and all that have an equation but the first, whose reading is the unit, at once."""
         chain = scene.chain
         if not effect.texts(chain.order, chain.is_complex):
             return
         others = chain.moving[1:]
         for both in (False, True)[: chain.levels]:
             # Where all sensors of a single level share a factor, that is a unit.
-            single = [(site,) for site in chain.moving] if chain.sites > 1 or chain.levels > 1 else []
+            single = [(site,) for site in range(chain.sites)] if chain.sites > 1 or chain.levels > 1 else []
             for sites in [*single, *([others] if len(others) > 1 else [])]:
                 yield cls(effect=effect, sites=sites, both=both, strength=(0.0,) * len(sites))
 

@@ -29,12 +29,12 @@ class Offset(OfSensors, acts="offset"):
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every site, and all of them at once."""
+        """Return every site, and all that have an equation at once."""
         chain = scene.chain
         if not effect.texts(chain.order, chain.is_complex):
             return
-        for sites in [*((site,) for site in chain.moving), *([chain.moving] if len(chain.moving) > 1 else [])]:
-            every = len(sites) == len(chain.moving)
+        for sites in [*((site,) for site in range(chain.sites)), *([chain.moving] if len(chain.moving) > 1 else [])]:
+            every = sites == chain.moving
             yield cls(
                 effect=effect, sites=sites, parts=chain.parts, every=every, strength=(0.0,) * (len(sites) * chain.parts)
             )
