@@ -15,6 +15,7 @@ Heavy packages (torch, pysindy) are imported where they are used, so that listin
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import numbers
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -48,6 +49,7 @@ class Abilities:
         truth: it must be shown the truth (a ceiling, not a contestant).
         motion: its fits have the motion that they follow, and the size of the noise.
         loads: packages that a fit imports; they are loaded before its clock starts.
+        needs: packages that are not installed with this one.
     """
 
     complex: bool = True
@@ -57,6 +59,12 @@ class Abilities:
     truth: bool = False
     motion: bool = False
     loads: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
+
+    @property
+    def missing_packages(self) -> tuple[str, ...]:
+        """Those of `needs` that are not installed."""
+        return tuple(name for name in self.needs if importlib.util.find_spec(name) is None)
 
 
 class Skipped(Exception):
@@ -224,7 +232,7 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
     if reason:
         raise Skipped(reason)
     shown = [s.observed() if isinstance(s, SimulatedSamples) and not method.abilities.truth else s for s in data]
-    for package in method.abilities.loads:
+    for package in (*method.abilities.loads, *method.abilities.needs):
         importlib.import_module(package)
     wall, cpu = time.perf_counter(), time.process_time()
     fit = method.fit(shown, library, order, seed)
@@ -282,6 +290,9 @@ def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:
 
 def obstacle(abilities: Abilities, data: Sequence[Samples], library: Library) -> str:
     """Return why a method cannot take the data; empty where it can."""
+    lacking = abilities.missing_packages
+    if lacking:
+        return f"it needs {' and '.join(lacking)}, not installed; try: pip install {' '.join(lacking)}"
     checks: list[tuple[bool, Callable[[Samples], bool], str]] = [
         (abilities.complex, lambda s: s.is_complex, "it does not take complex fields"),
         (

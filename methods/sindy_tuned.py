@@ -46,9 +46,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from latticebench.methods.engine.derivatives import KINDS, LOADS, takes
-from latticebench.methods.engine.integrated_equation import IntegratedEquation, integrate_equation
+from latticebench.methods.engine.integrated_equation import (
+    PRICE,
+    SPAN,
+    IntegratedEquation,
+    information_criterion,
+    integrate_equation,
+)  # fmt: skip
 from latticebench.methods.engine.regression import Regression, rows, triangular
-from latticebench.methods.engine.sparse import fitted_optimizer, sparse_fit
+from latticebench.methods.engine.sparse import THRESHOLDS, fitted_optimizer, sparse_fit, stlsq_path
 from latticebench.methods.method import Abilities, Fit
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library
@@ -181,24 +187,19 @@ def path(
     small = triangular(regression)
     if optimizer in ("SSR", "FROLS"):
         return [(float(np.sum(support)), small.least_squares(support)) for support in _greedy(small, optimizer, seed)]
-    found, listed = [], set()
-    for threshold in thresholds:
-        if optimizer == "SR3":
-            # The relaxation that has with few rows the effect of 1 with all.
-            nu = len(regression.target) / len(small.target)
-            given = {"reg_weight_lam": threshold**2 / (2 * nu), "relax_coeff_nu": nu, "max_iter": 1000, "tol": 1e-8}
-            shares = fitted_optimizer(small, "SR3", {"regularizer": "L0", **given}, seed).coef_
-        else:
-            shares = fitted_optimizer(small, "STLSQ", {"threshold": threshold, "alpha": 0.0}, seed).coef_
-        support = np.ravel(shares) != 0
+    if optimizer == "STLSQ":
+        return stlsq_path(regression, thresholds, seed)
+    if optimizer == "ensemble":
         # Bagging is dear: a threshold that changes nothing for STLSQ is not bagged again.
-        if support.tobytes() in listed:
-            continue
-        listed.add(support.tobytes())
-        if optimizer == "ensemble":
-            found.append((threshold, _bagged(regression, threshold, models, seed)))
-        else:
-            found.append((threshold, small.least_squares(support)))
+        tried = [threshold for threshold, _ in stlsq_path(regression, thresholds, seed)]
+        return [(threshold, _bagged(regression, threshold, models, seed)) for threshold in tried]
+    found = []
+    for threshold in thresholds:
+        # The relaxation that has with few rows the effect of 1 with all.
+        nu = len(regression.target) / len(small.target)
+        given = {"reg_weight_lam": threshold**2 / (2 * nu), "relax_coeff_nu": nu, "max_iter": 1000, "tol": 1e-8}
+        shares = fitted_optimizer(small, "SR3", {"regularizer": "L0", **given}, seed).coef_
+        found.append((threshold, small.least_squares(np.ravel(shares) != 0)))
     return found
 
 
@@ -244,9 +245,9 @@ class SINDyTuned:
         "smoothing-spline", "spline", "FiniteDifference", "SmoothedFiniteDifference", "finite_difference", "spectral",
     )  # fmt: skip
     criterion: Literal["bic", "cv", "residual"] = "bic"
-    thresholds: tuple[float, ...] = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
-    span: float = 0.7
-    price: float = 2.0
+    thresholds: tuple[float, ...] = THRESHOLDS
+    span: float = SPAN
+    price: float = PRICE
     models: int = 20
     folds: int = 5
 
@@ -337,17 +338,13 @@ class SINDyTuned:
 
     def _scores(self, models: Sequence[SparseModel], judge: IntegratedEquation) -> Float[ndarray, " model"]:
         """Return the criterion of each model; less is better."""
-        coefficients = np.array([one.coefficients for one in models])
-        terms = np.count_nonzero(coefficients, axis=1)
-        if self.criterion == "residual":
-            lost = np.array([one.rows.regression.residual(one.coefficients) ** 2 for one in models])
-            counts = np.array([len(one.rows.place) for one in models])
-        elif self.criterion == "bic":
-            lost = judge.lost(coefficients) / len(judge.place)
-            counts = np.full(len(models), max(len(judge.place) // judge.overlap, 2))
-        else:
+        if self.criterion == "cv":
             return self._held_out(models, judge)
-        return np.asarray(counts * np.log(np.maximum(lost, 1e-300)) + self.price * terms * np.log(counts))
+        if self.criterion == "bic":
+            return judge.bic([one.coefficients for one in models], self.price)
+        terms = np.array([np.sum(one.support) for one in models])
+        lost = np.array([one.rows.regression.residual(one.coefficients) ** 2 for one in models])
+        return information_criterion(lost, np.array([len(one.rows.place) for one in models]), terms, self.price)
 
     def _held_out(self, models: Sequence[SparseModel], judge: IntegratedEquation) -> Float[ndarray, " model"]:
         """Return the mean square of each model in each part of the record, its support refitted on the other parts."""

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from numpy import ndarray
 
+# Length of a window in radians of the root-mean-square angular frequency, and the price of a term in multiples of the
+# usual one.
+SPAN = 0.7
+PRICE = 2.0
 # Gauss points in each interval between samples: exact for a cubic term of a cubic.
 POINTS = 5
 
@@ -58,8 +62,26 @@ class IntegratedEquation:
         with np.errstate(over="ignore", invalid="ignore"):
             return np.asarray(np.sum((small.target - coefficients @ small.design.T) ** 2, axis=1))
 
+    def bic(self, models: Sequence[Float[ndarray, " terms"]], price: float = PRICE) -> Float[ndarray, " model"]:
+        """Return the Bayesian information criterion of models' coefficients on the samples; less is better.
 
-def integrate_equation(data: Sequence[Samples], library: Library, order: int, span: float) -> IntegratedEquation:
+        The rows that count are those of windows that do not overlap. What the integral leaves of a model that
+        overflows is NaN.
+        """
+        coefficients = np.array(models)
+        count = max(len(self.place) // self.overlap, 2)
+        lost = self.lost(coefficients) / len(self.place)
+        return information_criterion(lost, count, np.count_nonzero(coefficients, axis=1), price)
+
+
+def information_criterion(
+    lost: Float[ndarray, " model"], rows: int | ndarray, terms: ndarray, price: float
+) -> Float[ndarray, " model"]:
+    """Return n log(mean square) + price k log n for models of k terms that leave a mean square of n rows."""
+    return np.asarray(rows * np.log(np.maximum(lost, 1e-300)) + price * terms * np.log(rows))
+
+
+def integrate_equation(data: Sequence[Samples], library: Library, order: int, span: float = SPAN) -> IntegratedEquation:
     """Integrate the terms along a smoothing spline over windows that begin at each sample.
 
     Args:
@@ -91,11 +113,11 @@ def _integrate(
 ) -> tuple[Float[ndarray, "rows terms_and_target"], Float[ndarray, " rows"], int]:
     """Return one trajectory's rows, the target in the last column, each row's place, and the steps per window."""
     t, sites = samples.t, observed(samples.sites, library.reach, samples.ends)
-    curves = _smooth(samples, samples.u)
+    curves = smooth_curves(samples, samples.u)
     w, z = curves[:2]
     below, rate = curves[order - 1 : order + 1]
     if order == 2 and samples.v is not None:
-        z = below = _smooth(samples, samples.v)[0]
+        z = below = smooth_curves(samples, samples.v)[0]
     frequency = _size(rate(t)) / _size(below(t) - np.nanmean(below(t), axis=0))
     steps = int(np.clip(round(span / (frequency * np.median(np.diff(t)))), 1, max(1, len(t) // 4)))
     points, weights = np.polynomial.legendre.leggauss(POINTS)
@@ -139,7 +161,7 @@ def _size(field: ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.abs(field) ** 2))) or 1.0
 
 
-def _smooth(samples: Samples, field: ndarray) -> list[Any]:
+def smooth_curves(samples: Samples, field: ndarray) -> list[Any]:
     """Return a site-wise smoothing spline and its first two derivatives, functions of time (P,) to (P, N)."""
     from scipy.interpolate import make_interp_spline
 

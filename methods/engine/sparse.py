@@ -6,12 +6,15 @@ coefficient as its term's share of the derivative, whatever the units and the nu
 
 from __future__ import annotations
 
+import contextlib
+import io
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latticebench.methods.engine.regression import triangular
 from latticebench.systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
@@ -19,6 +22,21 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
     from latticebench.methods.engine.regression import Regression
+
+
+# Thresholds to choose from: shares of the derivative's RMS.
+THRESHOLDS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+
+
+@contextlib.contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Let what draws from NumPy's global generator, as pysindy 2.1 does, draw from a seed; restore it afterwards."""
+    state = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed % 2**32)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
 
 
 def fitted_optimizer(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> Any:
@@ -47,19 +65,15 @@ def fitted_optimizer(regression: Regression, optimizer: str, arguments: Mapping[
         error = unknown("pysindy optimiser", optimizer, known)
         raise InputError(f"{error}; pysindy leaves out those whose solver is not installed (such as cvxpy)")
     height = np.sqrt(np.mean(regression.target**2)) or 1.0
-    # Bagging draws from NumPy's global generator (pysindy 2.1), which is seeded here and restored afterwards.
-    state = np.random.get_state()  # noqa: NPY002
-    np.random.seed(seed % 2**32)  # noqa: NPY002
     try:
-        with warnings.catch_warnings():
+        # A solver may print its licence, which is no part of the output.
+        with warnings.catch_warnings(), seeded(seed), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             return getattr(pysindy.optimizers, optimizer)(**arguments).fit(
                 regression.design / (regression.scales * height), regression.target[:, None] / height
             )
     except Exception as error:
         raise InputError(f"pysindy's {optimizer} with {dict(arguments)}: {error}") from error
-    finally:
-        np.random.set_state(state)  # noqa: NPY002
 
 
 def sparse_fit(
@@ -78,3 +92,27 @@ def sparse_fit(
     """
     shares = np.asarray(fitted_optimizer(regression, optimizer, arguments, seed).coef_)[0]
     return np.asarray(shares / regression.scales)
+
+
+def stlsq_path(
+    regression: Regression, thresholds: Sequence[float], seed: int
+) -> list[tuple[float, Float[ndarray, " terms"]]]:
+    """Run STLSQ, without ridge, over a path of thresholds.
+
+    Args:
+        regression: the rows.
+        thresholds: shares of the derivative's RMS (dimensionless).
+        seed: of the draws.
+
+    Returns:
+        one pair for each support found: the first threshold that gives it, and least squares on it (terms,).
+    """
+    small = triangular(regression)
+    found, listed = [], set()
+    for threshold in thresholds:
+        shares = fitted_optimizer(small, "STLSQ", {"threshold": threshold, "alpha": 0.0}, seed).coef_
+        support = np.ravel(shares) != 0
+        if support.tobytes() not in listed:
+            listed.add(support.tobytes())
+            found.append((threshold, small.least_squares(support)))
+    return found
