@@ -6,8 +6,12 @@ Runs are compared case by case in a table of a common form, whatever their kind:
     case        what people call it
     status      ok, or what went wrong
     right       for trials, whether the diagnosis was right; missing for others
+    method      for fits, who made it; missing for others
     e2          for fits, the relative error of the coefficients
     residual    what is left of the derivative (fits) or of the readings, in units of the noise (diagnoses)
+
+A single case may change for any reason; a method is called better or worse only where a paired test over its cases and
+seeds says so (`bench.paired`).
 """
 
 from __future__ import annotations
@@ -21,13 +25,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.paired import FLOOR, LEVEL, UNDECIDED, holm, median_ratio, signed_rank
 from latticebench.bench.published import read_table
 from latticebench.bench.store import is_store, open_store
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import DATA, read_json, shown
 
-# Round-off differs between machines; errors below this are all the same.
-FLOOR = 1e-9
 FACTOR = 2.0
 TABLES = ("cases.csv", "trials.csv", "laboratory.csv")
 NEEDED: Mapping[str, Sequence[str]] = {
@@ -35,7 +38,7 @@ NEEDED: Mapping[str, Sequence[str]] = {
     "trial": ("system", "effect", "z", "noise", "velocities", "seed", "status", "right", "residual_after"),
     "laboratory": ("asked", "seed", "status", "right", "residual_after"),
 }
-COLUMNS = ("identity", "case", "status", "right", "e2", "residual")
+COLUMNS = ("identity", "case", "method", "status", "right", "e2", "residual")
 
 
 @dataclass(frozen=True)
@@ -43,10 +46,13 @@ class Comparison:
     """The cases that two runs share, by what became of them.
 
     Attributes:
-        worse, better: tables with `case`, `old`, `new` (each with its measure) and `ratio` (of the errors).
+        worse, better: single cases: tables with `case`, `old`, `new` (each with its measure) and `ratio` (of the
+            errors).
         same: how many did neither.
         gone: cases that only the old run has.
         fresh: cases that only the new one has.
+        methods: for fits, a table with `method`, `pairs` (cases and seeds that both runs have), `ratio` (the median of
+            new over old E2), `p` (of a paired test, corrected for the number of methods) and `verdict`.
     """
 
     worse: pd.DataFrame
@@ -54,6 +60,7 @@ class Comparison:
     same: int
     gone: list[str]
     fresh: list[str]
+    methods: pd.DataFrame
 
 
 def compare(old: pd.DataFrame, new: pd.DataFrame, factor: float = FACTOR, floor: float = FLOOR) -> Comparison:
@@ -83,7 +90,28 @@ def compare(old: pd.DataFrame, new: pd.DataFrame, factor: float = FACTOR, floor:
         found[change].append({**row, "ratio": second / first if first else np.nan})
     worse, better = (pd.DataFrame(found[change], columns=["case", "old", "new", "ratio"]) for change in (1, -1))
     gone, fresh = before.index.difference(after.index, sort=False), after.index.difference(before.index, sort=False)
-    return Comparison(worse, better, len(found[0]), list(before.loc[gone, "case"]), list(after.loc[fresh, "case"]))
+    named = list(before.loc[gone, "case"]), list(after.loc[fresh, "case"])
+    return Comparison(worse, better, len(found[0]), *named, _by_method(before.loc[shared], after.loc[shared]))
+
+
+def _by_method(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
+    """Judge each method by all pairs of its errors, of tables that have the same cases in the same order."""
+    rows = []
+    pairs = pd.DataFrame({"method": after["method"], "old": _counted(before), "new": _counted(after)})
+    # A case in which neither has an error has no truth, or cannot be had.
+    pairs = pairs[np.isfinite(pairs[["old", "new"]]).any(axis=1)].dropna()
+    for method, group in pairs.groupby("method", sort=False):
+        old, new = group["old"].to_numpy(), group["new"].to_numpy()
+        rows.append((method, len(group), median_ratio(new, old), signed_rank(new, old)))
+    found = pd.DataFrame(rows, columns=["method", "pairs", "ratio", "p"])
+    found["p"] = holm(found["p"].tolist())
+    better = np.where(found["ratio"] < 1, "better", "worse")
+    return found.assign(verdict=np.where((found["p"] <= LEVEL) & (found["ratio"] != 1), better, UNDECIDED))
+
+
+def _counted(frame: pd.DataFrame) -> pd.Series:
+    """Return E2, infinite where a case failed and missing where it was skipped."""
+    return frame["e2"].where(frame["status"] == "ok", np.inf).where(frame["status"] != "skipped")
 
 
 def _change(a: Mapping[Any, Any], b: Mapping[Any, Any], first: float, second: float, factor: float) -> int:
@@ -158,7 +186,7 @@ def of_fits(frame: pd.DataFrame) -> pd.DataFrame:
     """Bring a table of cases (`bench.tables`) into the common form."""
     parts = ["data", "library", "method"]
     title = frame[parts[0]].str.cat(frame[parts[1:]], sep=" | ") + " | seed " + frame["seed"].astype(str)
-    return _common(frame, identity=frame["identity"], case=title)
+    return _common(frame, identity=frame["identity"], case=title, method=frame["method"])
 
 
 def of_trials(frame: pd.DataFrame) -> pd.DataFrame:
@@ -202,7 +230,7 @@ def _reports(paths: Iterable[Path]) -> pd.DataFrame:
 
 
 def _common(frame: pd.DataFrame, **columns: Any) -> pd.DataFrame:
-    made = frame.assign(**columns)
+    made = frame.drop(columns="method", errors="ignore").assign(**columns)
     for name in COLUMNS:
         if name not in made:
             made[name] = np.nan

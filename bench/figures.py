@@ -14,7 +14,7 @@ import pandas as pd
 from latticebench.bench.escape import label
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.provenance import lines
-from latticebench.bench.tables import cases, summary
+from latticebench.bench.tables import cases, named, summary
 from latticebench.systems.files import whole
 from latticebench.systems.terms import Term
 
@@ -108,7 +108,7 @@ def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
         gridspec_kw={"width_ratios": widths},
     )  # fmt: skip
     for axes, result in zip(all_axes[0], learnt, strict=False):
-        history, name = result["history"], result["case"]["label"]
+        history, name = result["history"], named(result["case"])
         curves = np.array(history["coefficients"])
         for k, term in enumerate(terms):
             axes.plot(history["step"], curves[:, k], color=colours[term], lw=0.9 if colours[term] == "black" else 1.6)
@@ -120,7 +120,7 @@ def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
             # Side by side, since terms with the same coefficient would hide each other.
             beside = place + 0.6 * ((k + 0.5) / len(terms) - 0.5)
             last.plot(beside, value, "o", color=colours[term], ms=3 if colours[term] == "black" else 4)
-    names = [_with_error(result["case"]["label"], result) for result in group]
+    names = [_with_error(named(result["case"]), result) for result in group]
     last.set_xticks(range(len(group)), names, rotation=60, ha="right", rotation_mode="anchor", fontsize=7)
     last.set_xlim(-0.6, len(group) - 0.4)
     for axes in all_axes[0]:

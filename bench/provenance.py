@@ -10,7 +10,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,16 @@ DISTRIBUTION = "latticebench"
 MOST_LISTED = 10
 
 
-def origin() -> dict[str, Any]:
-    """Describe what computes a result: commit, date, machine and versions."""
+def origin(loads: Collection[str] = ()) -> dict[str, Any]:
+    """Describe what computes a result: commit, date, machine, kernels of its linear algebra, and versions.
+
+    Args:
+        loads: packages that other processes load to compute it.
+    """
     date = datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d")
-    return {"commit": commit(), "date": date, "machine": machine(), "versions": versions()}
+    return {
+        "commit": commit(), "date": date, "machine": machine(), "kernels": kernels(loads), "versions": versions(),
+    }  # fmt: skip
 
 
 def describe(origins: Sequence[Mapping[str, Any]], run: Mapping[str, Any], seeds: Iterable[int] = ()) -> dict[str, Any]:
@@ -37,8 +43,9 @@ def describe(origins: Sequence[Mapping[str, Any]], run: Mapping[str, Any], seeds
         seeds: of the cases; 1 where none has any.
     """
     described: dict[str, Any] = dict(run)
-    for name in ("commit", "date", "machine"):
-        described[name] = sorted({str(one[name]) for one in origins})
+    for name in ("commit", "date", "machine", "kernels"):
+        # Results of earlier versions do not say their kernels.
+        described[name] = sorted({str(one[name]) for one in origins if name in one})
     packages: dict[str, set[str]] = {}
     for one in origins:
         for package, version in one["versions"].items():
@@ -100,6 +107,45 @@ def machine() -> str:
         pass
     memory = round(psutil.virtual_memory().total / 2**30)
     return f"{processor}, {os.cpu_count()} cores, {memory} GiB, {platform.system()} {platform.machine()}"
+
+
+def kernels(loads: Collection[str] = ()) -> str:
+    """Describe what decides the last digits: each BLAS library with its kernel, torch's instructions, and the threads.
+
+    Args:
+        loads: packages that other processes load; torch is asked in one of its own where it is among them.
+    """
+    from threadpoolctl import threadpool_info
+
+    if loads:
+        # SciPy has a library of its own.
+        import scipy.linalg  # noqa: F401
+    told = set()
+    for one in threadpool_info():
+        if one["user_api"] == "blas":
+            kernel = one.get("architecture") or "unknown kernel"
+            told.add(f"{one['internal_api']} {one['version']} {kernel} {_threads(one['num_threads'])}")
+    return ", ".join([*sorted(told), *_torch(loads)])
+
+
+def _torch(loads: Collection[str]) -> list[str]:
+    """Return torch's instructions and threads, where torch is used."""
+    if "torch" in sys.modules:
+        torch = sys.modules["torch"]
+        return [f"torch {torch.backends.cpu.get_cpu_capability()} {_threads(torch.get_num_threads())}"]
+    if "torch" not in loads:
+        return []
+    asked = "import torch; print(torch.backends.cpu.get_cpu_capability(), torch.get_num_threads())"
+    try:
+        done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True, timeout=60)
+        capability, threads = done.stdout.split()
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return ["torch unknown"]
+    return [f"torch {capability} {_threads(int(threads))}"]
+
+
+def _threads(number: int) -> str:
+    return f"{number} thread{'s' if number > 1 else ''}"
 
 
 def versions() -> dict[str, str]:

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from latticebench.bench.escape import csv_table, markdown
+from latticebench.bench.paired import paired
 from latticebench.bench.provenance import lines
 from latticebench.bench.tables import ABOUT, summary, tables
 from latticebench.systems.errors import printable
@@ -18,7 +19,7 @@ from latticebench.systems.files import write_text
 from latticebench.systems.terms import Term
 
 FORMATS = ("csv", "md", "tex")
-TABLES = ("cases", "coefficients", "limits", "summary", "errors")
+TABLES = ("cases", "coefficients", "limits", "summary", "errors", "paired")
 # A longer table is for programs.
 MOST_READ = 1000
 NUMBER = re.compile(r"(-?)(\d+)(?:\.(\d+))?(?:e([+-]\d+))?")
@@ -29,15 +30,19 @@ NEEDS = r"needs \usepackage{booktabs,siunitx} \usepackage[T1]{fontenc}"
 def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
     """Arrange the summary as part, data and library against method; a cell without a figure says why.
 
-    The bound stands beside errors where it is known.
+    A cell is the median over the seeds; where there are several, their middle 80 % and number follow. The bound stands
+    beside errors where it is known.
     """
-    short = summary(table)
+    short = summary(table, value)
     if short.empty:
         return pd.DataFrame(columns=ABOUT)
     status = table.drop_duplicates([*ABOUT, "method"])["status"].tolist()
 
     def shown(row: pd.Series, state: str) -> str:
         figure = format_number(row[value])
+        if figure and row["seeds"] > 1:
+            low, high = (format_number(row[f"{value}_{end}"]) for end in ("low", "high"))
+            return f"{figure} [{low}, {high}] n={row['seeds']}"
         if figure or state != "ok":
             return figure or state
         # Where the equation is outside the library, what it leaves of the derivative is all there is to say.
@@ -82,7 +87,8 @@ def publish(
         InputError: a file cannot be written.
     """
     made = tables(results)
-    made |= {"summary": summary(made["cases"]), "errors": matrix(made["cases"])}
+    every = made["cases"]
+    made |= {"summary": summary(every), "errors": matrix(every), "paired": paired(every)}
     written = []
     for name in only:
         frame = made[name]

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from latticebench import methods
 from latticebench.bench import source
 from latticebench.bench.case import Case
 from latticebench.bench.leases import Leases
@@ -15,6 +16,7 @@ from latticebench.bench.pool import Turn, execute
 from latticebench.bench.provenance import origin
 from latticebench.bench.store import WHOLE, Results, Shard, Store
 from latticebench.bench.suite import Suite
+from latticebench.methods.method import make
 
 
 class Watcher(Protocol):
@@ -69,7 +71,7 @@ def run(
     """
     keys = source.keys(suite.by_identity, suite.folders)
     store.plan(keys, about or {})
-    made = origin()
+    made = origin(_loads(suite))
     before = store.finished()
     wanted = dict(itertools.islice(zip(keys.values(), suite.cases, strict=True), shard.first - 1, None, shard.step))
     waiting = [case for key, case in wanted.items() if key not in before or not _counts(case, *before[key], retry)]
@@ -125,6 +127,17 @@ class _Turns:
 def _renamed(cases: Mapping[str, Case], finished: Mapping[str, tuple[str, str]]) -> dict[str, Case]:
     """Return the cases whose result is stored under another label or limit."""
     return {key: one for key, one in cases.items() if key in finished and finished[key][1] != one.model_dump_json()}
+
+
+def _loads(suite: Suite) -> set[str]:
+    """Return the packages that the methods of this package load for a suite; a user's code is run by workers alone."""
+    known = methods.registered()
+    return {
+        package
+        for one in suite.methods.values()
+        if one.method in known
+        for package in make(known[one.method], one.settings).abilities.loads
+    }
 
 
 def _counts(case: Case, status: str, text: str, retry: bool) -> bool:

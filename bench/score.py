@@ -5,8 +5,9 @@ With xi* the true and xi the found coefficients over the library:
     E2       |xi - xi*| / |xi*|
     Einf     max over the true terms |xi_j - xi*_j| / |xi*_j|
     spurious max |xi_j| over the absent terms (in units of the derivative over those of the term)
-    support  TPR = TP / (TP + FP + FN); a term is found when its share |xi_j| RMS(T_j) reaches PRESENT times the RMS of
-             the derivative, both on the noise-free samples: one threshold for every method
+    support  TPR = TP / (TP + FP + FN); a term is found when its share |xi_j| RMS(T_j), on the noise-free samples, is
+             nearer to that of the least true term than to 0: one cutoff for every method, which follows from the
+             equation and is no method's own threshold
     forecast relative L2 error of a simulation from an initial state that no method saw, and the time until it exceeds
              0.1
 """
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from numpy import ndarray
 
-PRESENT = 0.05
+# Of the least true share: half way to 0.
+PRESENT = 0.5
 LOST = 0.1
 FORECAST_TOLERANCE = 1e-9
 MAX_EVALUATIONS = 200_000
@@ -59,7 +61,7 @@ def score(found: Float[ndarray, " terms"], truth: Float[ndarray, " terms"], shar
         shares: RMS(T_j) over the RMS of the derivative, on the noise-free samples.
     """
     true = truth != 0
-    present = support(found, shares)
+    present = support(found, truth, shares)
     hits, false, missed = np.sum(present & true), np.sum(present & ~true), np.sum(~present & true)
     return Score(
         e2=float(np.linalg.norm(found - truth) / np.linalg.norm(truth)),
@@ -69,9 +71,12 @@ def score(found: Float[ndarray, " terms"], truth: Float[ndarray, " terms"], shar
     )
 
 
-def support(found: Float[ndarray, " terms"], shares: Float[ndarray, " terms"]) -> Bool[ndarray, " terms"]:
-    """Return which terms count as found."""
-    present: ndarray = np.abs(found) * shares >= PRESENT
+def support(
+    found: Float[ndarray, " terms"], truth: Float[ndarray, " terms"], shares: Float[ndarray, " terms"]
+) -> Bool[ndarray, " terms"]:
+    """Return which terms count as found; the arguments are those of `score`."""
+    least = np.min((np.abs(truth) * shares)[truth != 0])
+    present: ndarray = np.abs(found) * shares >= PRESENT * least
     return present
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from latticebench import methods
 from latticebench.bench.fitting import described
 from latticebench.bench.published import read_table
 from latticebench.bench.store import is_store, open_store
@@ -23,6 +25,10 @@ SCORES = (
 FEW = 3
 # Standard errors to each side of a 95 % interval.
 INTERVAL = 1.96
+# The part of its seeds that a spread holds.
+SPREAD = (0.1, 0.9)
+# What stands behind the name of a method that is no contestant.
+SHOWN = " (shown the truth)"
 # What a row of the matrix is about; a column of it is a method.
 ABOUT = ["part", "data", "library"]
 
@@ -85,7 +91,24 @@ def limits(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 
 def _head(case: Mapping[str, Any]) -> tuple[Any, ...]:
     """Return the first columns of both tables: part, data, library, method, noise, seed."""
-    return case["part"], described(case), case["library"], case["label"], case["noise"], case["seed"]
+    return case["part"], described(case), case["library"], named(case), case["noise"], case["seed"]
+
+
+def named(case: Mapping[str, Any]) -> str:
+    """Return what a case's method is called in tables and figures: its label, marked where it is shown the truth."""
+    return f"{case['label']}{SHOWN if _takes_truth(case['method']) else ''}"
+
+
+def shown_truth(name: str) -> bool:
+    """Return whether a name of `named` is that of a method that is shown the truth."""
+    return name.endswith(SHOWN)
+
+
+@functools.cache
+def _takes_truth(method: str) -> bool:
+    """Return whether a method of this package is shown the truth; code of a user's is not run to draw a table."""
+    kind = methods.registered().get(method)
+    return kind is not None and kind().abilities.truth
 
 
 def _case(head: tuple[Any, ...], result: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -124,11 +147,24 @@ def _covered(result: Mapping[str, Any]) -> float:
     return float(sum(held) / len(held))
 
 
-def summary(table: pd.DataFrame) -> pd.DataFrame:
+def counted(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table of cases in which what failed or ran out of time has an infinite error, where there is a truth."""
+    found = table.copy()
+    missed = ~found["status"].isin(["ok", "skipped"])
+    # Where fits ended and yet none has an E2, there is no truth.
+    ended = (found["status"] == "ok").groupby([found[name] for name in ABOUT]).transform("any")
+    no_truth = ended & found.groupby(ABOUT)["e2"].transform(lambda e: bool(e.isna().all()))
+    found.loc[missed & ~no_truth, ["e2", "einf", "forecast_error"]] = np.inf
+    found.loc[missed, ["tpr", "forecast_horizon"]] = 0.0
+    return found
+
+
+def summary(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
     """Sum the table of cases up over seeds: one row for data, library and method.
 
-    A case that failed or ran out of time counts as an infinite error and stays in the median; one that was skipped
-    leaves no figure. `ok` counts the cases that ended with a fit. `efficiency` is the Cramer-Rao bound over the
+    Scores are medians. Of `value`, `_low` and `_high` are the quantiles of SPREAD among the seeds, of which `seeds` is
+    the number. A case that failed or ran out of time counts as an infinite error and stays in the median; one that was
+    skipped leaves no figure. `ok` counts the cases that ended with a fit. `efficiency` is the Cramer-Rao bound over the
     root-mean-square of E2 over the seeds: 1 is the best that an unbiased method can do, a failure makes it 0, and
     with fewer than FEW seeds it is left out; a biased method may pass 1 where the samples say little, since 0 for
     every coefficient is never more than 100 % off. `coverage` is the share of the 95 % intervals (1.96 standard
@@ -136,20 +172,20 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     """
     if table.empty:
         return pd.DataFrame(columns=[*ABOUT, "method"])
-    counted = table.copy()
-    missed = ~counted["status"].isin(["ok", "skipped"])
-    # Where fits ended and yet none has an E2, there is no truth.
-    ended = (counted["status"] == "ok").groupby([counted[name] for name in ABOUT]).transform("any")
-    no_truth = ended & counted.groupby(ABOUT)["e2"].transform(lambda e: bool(e.isna().all()))
-    counted.loc[missed & ~no_truth, ["e2", "einf", "forecast_error"]] = np.inf
-    counted.loc[missed, ["tpr", "forecast_horizon"]] = 0.0
-    grouped = counted.groupby([*ABOUT, "method"], sort=False)
+    full = counted(table)
+    grouped = full.groupby([*ABOUT, "method"], sort=False)
     found = grouped[[*SCORES]].median()
+    place = found.columns.get_loc(value) + 1
+    for share, end in zip(SPREAD, ("low", "high"), strict=True):
+        # The nearest of the seeds: between a number and a failure there is nothing.
+        found.insert(place, f"{value}_{end}", grouped[value].quantile(share, interpolation="nearest"))
+        place += 1
     found["efficiency"] = grouped[["bound", "e2"]].apply(_efficiency)
-    if "covered" in counted:
+    if "covered" in full:
         found["coverage"] = grouped["covered"].mean()
     found.insert(0, "ok", grouped["status"].agg(lambda s: f"{int((s == 'ok').sum())}/{len(s)}"))
-    keys = pd.MultiIndex.from_frame(counted[[*ABOUT, "method"]].drop_duplicates())
+    found.insert(1, "seeds", grouped[value].count())
+    keys = pd.MultiIndex.from_frame(full[[*ABOUT, "method"]].drop_duplicates())
     return found.reindex(keys).reset_index()
 
 

@@ -71,10 +71,10 @@ def bag(regression: Regression, threshold: float, models: int, dropped: int, see
     class Telling(pysindy.STLSQ):  # type: ignore[misc]
         """STLSQ that marks what it drops by NaN: pysindy's ensemble has 0 for what was not offered."""
 
-        def fit(self, x: Any, y: Any, **given: Any) -> Telling:
-            super().fit(x, y, **given)
-            self.coef_ = np.where(self.coef_ == 0, np.nan, self.coef_)
-            return self
+        def fit(self, x: Any, y: Any, **given: Any) -> Any:
+            fitted = super().fit(x, y, **given)
+            fitted.coef_ = np.where(fitted.coef_ == 0, np.nan, fitted.coef_)
+            return fitted
 
     given = {"opt": Telling(threshold=threshold, alpha=0.0), "bagging": True, "n_models": models}
     if dropped:

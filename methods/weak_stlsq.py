@@ -173,19 +173,18 @@ def _series(samples: Samples, library: Library, order: int, finer: int) -> tuple
     """
     steps = np.linspace(0, len(samples.t) - 1, (len(samples.t) - 1) * finer + 1)
     t = np.interp(steps, np.arange(len(samples.t)), samples.t)
-    w, z = smooth_curves(samples, samples.u)[:2] if finer > 1 or order == 2 else (None, None)
-    u = samples.u if finer == 1 else w(t)
-    v = None
-    if order == 2 and samples.v is None:
-        v = z(t)
-    elif order == 2:
+    curves = smooth_curves(samples, samples.u)
+    u = samples.u if finer == 1 else curves[0](t)
+    v = curves[1](t) if order == 2 else None
+    field, derivative = u, order
+    if order == 2 and samples.v is not None:
         v = samples.v if finer == 1 else smooth_curves(samples, samples.v)[0](t)
+        field, derivative = v, 1
     f = None if samples.f is None or not library.uses("f") else inputs(samples, t)
     values = evaluate(library.terms, u, v, f, t, ends=samples.ends)
-    seen = u if order == 1 or samples.v is None else v
-    inner = seen[:, observed(samples.sites, library.reach, samples.ends)]
-    field = np.concatenate([inner.real, inner.imag], axis=1) if samples.is_complex else inner
-    return t, values, field, 2 if order == 2 and samples.v is None else 1
+    inner = field[:, observed(samples.sites, library.reach, samples.ends)]
+    parts = np.concatenate([inner.real, inner.imag], axis=1) if samples.is_complex else inner
+    return t, values, parts, derivative
 
 
 METHODS = (WeakSTLSQ,)

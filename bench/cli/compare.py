@@ -18,7 +18,7 @@ def compare(
     factor: Annotated[float, typer.Option(min=1.0, help="An error that grew beyond this factor is a loss.")] = 2.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
 ) -> None:
-    """Compare two runs case by case; exit code 1 when any case got worse."""
+    """Compare two runs case by case, and each method by a paired test; exit code 1 when any case is a loss."""
     from latticebench.bench.compare import compare as compare_runs
     from latticebench.bench.compare import read_run
 
@@ -29,16 +29,17 @@ def compare(
 
         print(to_json(compare_document(found, provenance())), end="")
     else:
-        for name, frame in (("worse", found.worse), ("better", found.better)):
+        for name, frame in (("loss", found.worse), ("gain", found.better)):
             for _, row in frame.iterrows():
                 print(printable(f"{name}: {row['case']}: {row['old']} -> {row['new']}"))
         for name in found.gone:
             print(printable(f"gone: {name}"))
         for name in found.fresh:
             print(printable(f"new: {name}"))
-        print(
-            f"{len(found.worse)} worse, {len(found.better)} better, {found.same} the same "
-            f"(within a factor of {factor:g})"
-        )
+        for _, row in found.methods.iterrows():
+            told = f"{row['pairs']} pairs, median ratio {row['ratio']:.3g}, p = {row['p']:.2g}"
+            print(printable(f"{row['verdict']}: {row['method']} ({told})"))
+        counts = f"{len(found.worse)} losses, {len(found.better)} gains, {found.same} the same"
+        print(f"{counts} (within a factor of {factor:g})")
     if len(found.worse):
         raise typer.Exit(1)

@@ -178,11 +178,22 @@ class ComparedCase(Content):
     ratio: Number
 
 
+class ComparedMethod(Content):
+    """A method judged by all cases and seeds that both runs have, see `bench.compare`."""
+
+    method: str
+    pairs: int
+    ratio: Number
+    p: Number
+    verdict: str
+
+
 class CompareDocument(Document):
     """One run judged by another, see `latticebench compare`.
 
     Attributes:
-        worse, better: cases whose error grew or fell by more than a factor.
+        worse, better: single cases whose error grew or fell by more than a factor.
+        methods: what a paired test says of each method.
         same: how many did neither.
         gone, new: cases that only one of the runs has.
     """
@@ -192,6 +203,7 @@ class CompareDocument(Document):
     )
     worse: list[ComparedCase]
     better: list[ComparedCase]
+    methods: list[ComparedMethod]
     same: int
     gone: list[str]
     new: list[str]
@@ -250,4 +262,5 @@ def compare_document(found: Comparison, about: Provenance) -> CompareDocument:
         provenance=about, same=found.same, gone=found.gone, new=found.fresh,
         worse=[ComparedCase.model_validate(row) for row in found.worse.to_dict("records")],
         better=[ComparedCase.model_validate(row) for row in found.better.to_dict("records")],
+        methods=[ComparedMethod.model_validate(row) for row in found.methods.to_dict("records")],
     )  # fmt: skip

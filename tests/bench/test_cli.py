@@ -197,7 +197,7 @@ def test_a_run_its_table_its_figures_and_its_comparison(tiny: Path) -> None:
     files = succeed("figures", "tiny", "--out", "published", cwd=tiny).split()
     assert {Path(file).name for file in files} >= {"errors.png", "error-against-seconds.png", "error-against-noise.png"}
     assert all((tiny / file).stat().st_size > 5000 for file in files)
-    assert "0 worse, 0 better, 9 the same" in succeed("compare", "tiny", "published", cwd=tiny)
+    assert "0 losses, 0 gains, 9 the same" in succeed("compare", "tiny", "published", cwd=tiny)
 
 
 def test_comparing_names_what_got_worse_and_exits_with_1(tiny: Path) -> None:
@@ -211,7 +211,7 @@ def test_comparing_names_what_got_worse_and_exits_with_1(tiny: Path) -> None:
     frame.to_csv(tiny / "better.csv", index=False)
     worse = latticebench("compare", "better.csv", "tiny", cwd=tiny)
     assert worse.returncode == 1
-    assert "worse: phi4 noise=0.01 | lib2 | stlsq | seed 1" in worse.stdout
+    assert "loss: phi4 noise=0.01 | lib2 | stlsq | seed 1" in worse.stdout
     better = latticebench("compare", "tiny", "better.csv", "--json", cwd=tiny)
     assert better.returncode == 0
     assert len(json.loads(better.stdout)["better"]) == 1

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -53,6 +54,27 @@ def test_cases_that_only_one_side_has_are_named() -> None:
 def test_runs_without_a_common_case_cannot_be_compared() -> None:
     with pytest.raises(InputError, match="no case in common"):
         compare(fits(("a", 1, 0.1)), fits(("b", 1, 0.1)))
+
+
+def test_a_method_is_better_only_where_enough_pairs_say_so() -> None:
+    rng = np.random.default_rng(1)
+    sizes = np.exp(rng.normal(size=(2, 12)))
+    old = fits(*(("a", seed, float(sizes[0, seed])) for seed in range(12)), *(("b", s, 0.1) for s in range(4)))
+    better = fits(
+        *(("a", seed, float(sizes[0, seed]) * 0.9) for seed in range(12)), *(("b", s, 0.01) for s in range(4))
+    )
+    other = fits(
+        *(("a", seed, float(sizes[1, seed])) for seed in range(12)), *(("b", s, None, "failed") for s in range(4))
+    )
+    told = compare(old, better).methods.set_index("method")
+    # A tenth less in all of twelve pairs is sure, ten times less in four is not: 2 / 2^4 is more than 0.05.
+    assert list(told["verdict"]) == ["better", "not told apart"]
+    assert list(told["pairs"]) == [12, 4]
+    assert told.loc["a", "ratio"] == pytest.approx(0.9)
+    assert told.loc["a", "p"] == pytest.approx(2 * 2 / 2**12)
+    assert list(compare(better, old).methods["verdict"]) == ["worse", "not told apart"]
+    assert list(compare(old, other).methods["verdict"]) == ["not told apart", "not told apart"]
+    assert list(compare(old, old).methods["p"]) == [1.0, 1.0]
 
 
 HEAD = "# command: latticebench run loop\nsystem,effect,z,noise,velocities,seed,status,right,residual_after\n"

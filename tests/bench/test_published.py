@@ -6,7 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+import pandas as pd
 import pytest
+
+from latticebench import systems
+from latticebench.methods.engine.integrated_equation import PRICE, SPAN
 
 RESULTS = Path(__file__).parents[2] / "results"
 SCRIPTS = sorted(path.relative_to(RESULTS).as_posix() for path in RESULTS.rglob("*.py"))
@@ -23,3 +27,30 @@ def test_a_page_is_what_its_script_makes_of_the_tables_beside_it(
 ) -> None:
     published = (RESULTS / path).with_suffix(".md").read_text(encoding="utf-8")
     assert script(path).page() == published
+
+
+def test_the_constants_in_use_are_those_that_their_table_chooses_on_lattices_outside_the_benchmark(
+    script: Callable[[str], ModuleType],
+) -> None:
+    chooses = script("tuned/constants.py")
+    table = pd.read_csv(RESULTS / "tuned" / "constants.csv", comment="#")
+    best = table.loc[table["ratio"].idxmin()]
+    assert (best["span"], best["price"]) == (SPAN, PRICE)
+    # Not at the rim of what was tried.
+    assert min(chooses.SPANS) < SPAN < max(chooses.SPANS)
+    assert min(chooses.PRICES) < PRICE < max(chooses.PRICES)
+    ours = {systems.find(name).equation for name in systems.names()}
+    own = list(chooses.lattices())
+    assert not ours & {one.equation for one in own}
+    assert all(one.truth(one.libraries[0], one.parameters) is not None for one in own)
+
+
+def test_the_choice_is_the_least_geometric_mean_of_capped_ratios(script: Callable[[str], ModuleType]) -> None:
+    chooses = script("tuned/constants.py")
+    table = pd.DataFrame(
+        [(1.0, 2.0, 1.0, True), (1.0, 2.0, 1e6, False), (2.0, 2.0, 4.0, True), (2.0, 2.0, 2.0, True)],
+        columns=["span", "price", "ratio", "right"],
+    )
+    # sqrt(1 * 10) is more than sqrt(4 * 2).
+    assert list(chooses.means(table)["ratio"]) == pytest.approx([10**0.5, 8**0.5])
+    assert chooses.chosen(table) == (2.0, 2.0)

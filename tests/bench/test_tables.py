@@ -62,6 +62,24 @@ def test_a_failure_counts_as_infinite_and_stays_in_the_median_and_a_skip_leaves_
     assert list(short.loc["lib1", "ok"]) == ["2/3", "1/3", "0/3", "3/3"]
 
 
+def test_a_method_that_is_shown_the_truth_is_marked_wherever_it_is_named(tmp_path: Path) -> None:
+    results = [result("a", 1, 0.1), result("oracle", 1, 1e-15), result("oracle", 2, None, "skipped")]
+    publish(results, ABOUT, tmp_path)
+    for name in ("cases", "coefficients", "summary", "errors"):
+        for form in ("csv", "md", "tex"):
+            text = (tmp_path / f"{name}.{form}").read_text()
+            assert text.count("oracle") - text.count('"method": "oracle"') >= 1
+            assert all("(shown the truth)" in line for line in text.splitlines() if "oracle" in line.split('""')[0])
+    assert set(cases(results)["method"]) == {"a", "oracle (shown the truth)"}
+
+
+def test_the_spread_holds_the_middle_of_the_seeds() -> None:
+    short = summary(cases([result("a", seed, seed / 100) for seed in range(1, 22)])).iloc[0]
+    assert (short["e2"], short["e2_low"], short["e2_high"], short["seeds"]) == (0.11, 0.03, 0.19, 21)
+    alone = matrix(cases([result("a", 1, 0.1)]))
+    assert list(alone["a"]) == ["0.1"]
+
+
 def test_the_coverage_is_the_share_of_intervals_that_hold_the_truth(tmp_path: Path) -> None:
     def sure(seed: int, value: float, noise: float = 0.01) -> dict[str, Any]:
         made = result("a", seed, 0.1)
@@ -108,7 +126,9 @@ def test_the_efficiency_is_the_bound_over_the_root_mean_square_error_of_the_seed
 
 def test_a_cell_without_a_figure_says_why() -> None:
     wide = matrix(cases(RESULTS)).set_index("library")
-    assert list(wide.loc["lib1", ["a", "b", "c", "d"]]) == ["0.3", "inf", "skipped", "0.1"]
+    assert list(wide.loc["lib1", ["a", "b", "c", "d"]]) == [
+        "0.3 [0.1, inf] n=3", "inf [0.2, inf] n=3", "skipped", "0.1 [0.1, inf] n=3"
+    ]  # fmt: skip
     assert wide.loc["lib9", "a"] == "no truth, leaves 0.25"
     assert wide.loc["lib9", "b"] == "failed"
 
@@ -131,7 +151,7 @@ def test_parts_of_a_suite_are_told_apart() -> None:
 
 def test_what_is_published_can_be_read_and_carries_where_it_comes_from(tmp_path: Path) -> None:
     paths = publish(RESULTS, ABOUT, tmp_path)
-    assert len(paths) == 12
+    assert len(paths) == 15
     for path in paths:
         text = path.read_text()
         for word in ("command: latticebench run mine", "commit:", "machine:", "versions:", "seeds: 1, 2, 3"):
