@@ -99,7 +99,7 @@ def _by_method(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     rows = []
     pairs = pd.DataFrame({"method": after["method"], "old": _counted(before), "new": _counted(after)})
     # A case in which neither has an error has no truth, or cannot be had.
-    pairs = pairs[np.isfinite(pairs[["old", "new"]]).any(axis=1)].dropna()
+    pairs = pairs.loc[np.isfinite(pairs[["old", "new"]]).any(axis=1)].dropna()
     for method, group in pairs.groupby("method", sort=False):
         old, new = group["old"].to_numpy(), group["new"].to_numpy()
         rows.append((method, len(group), median_ratio(new, old), signed_rank(new, old)))

@@ -134,7 +134,7 @@ def _loads(suite: Suite) -> set[str]:
     known = methods.registered()
     return {
         package
-        for one in suite.methods.values()
+        for one in suite.contestants.values()
         if one.method in known
         for package in make(known[one.method], one.settings).abilities.loads
     }

@@ -175,11 +175,10 @@ def summary(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
     full = counted(table)
     grouped = full.groupby([*ABOUT, "method"], sort=False)
     found = grouped[[*SCORES]].median()
-    place = found.columns.get_loc(value) + 1
-    for share, end in zip(SPREAD, ("low", "high"), strict=True):
+    place = list(found.columns).index(value) + 1
+    for number, (share, end) in enumerate(zip(SPREAD, ("low", "high"), strict=True)):
         # The nearest of the seeds: between a number and a failure there is nothing.
-        found.insert(place, f"{value}_{end}", grouped[value].quantile(share, interpolation="nearest"))
-        place += 1
+        found.insert(place + number, f"{value}_{end}", grouped[value].quantile(share, interpolation="nearest"))
     found["efficiency"] = grouped[["bound", "e2"]].apply(_efficiency)
     if "covered" in full:
         found["coverage"] = grouped["covered"].mean()
