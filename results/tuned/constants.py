@@ -2,12 +2,12 @@
 
     python results/tuned/constants.py
 
-Methods that are tuned by the samples judge models by the equation integrated over windows (`methods.engine.
-integrated_equation`): SPAN is the length of a window, PRICE what a term costs. Both are chosen here, on lattices of
-which none is in the benchmark, from states that it does not have. Each of these lattices is simulated from two states;
-`sindy-tuned` makes its models of the samples at each level of noise; and each pair of constants chooses among them.
-Only here the truth is in view: E2 of the model chosen over that of the best model there is, and whether its support is
-right.
+Methods that are tuned by the samples judge models by the equation integrated over windows
+(`methods.engine.integrated_equation`): SPAN is the length of a window, PRICE what a term costs. Both are chosen here,
+on lattices of which none is in the benchmark, from states that it does not have. Each of these lattices is simulated
+from two states, sampled 50 times densely from one and sparsely from the other; `sindy-tuned` makes its models of the
+samples at each level of noise; and each pair of constants chooses among them. Only here the truth is in view: E2 of the
+model chosen over that of the best model there is, and whether its support is right.
 
 The pair with the least geometric mean of that ratio, each ratio counted as at most WORST, is taken.
 """
@@ -33,6 +33,8 @@ HERE = Path(__file__).parent
 SPANS = (0.35, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 PRICES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 NOISE = (0.0, 0.001, 0.01, 0.05)
+# Of the recordings, in units of time.
+LENGTHS = (8.0, 20.0)
 # A model that is so many times worse than the best is as bad as any.
 WORST = 10.0
 WAVES = "0.9*sin(0.5*x+draw)+0.6*cos(1.1*x+2*draw)"
@@ -74,14 +76,14 @@ def lattices() -> Iterator[System]:
         )  # fmt: skip
 
 
-def measure(systems: Iterator[System], draws: int = 2) -> pd.DataFrame:
+def measure(systems: Iterator[System]) -> pd.DataFrame:
     """Return one row per lattice, state, noise, span and price: the ratio of the errors, and whether it is right."""
     method = methods.find("sindy-tuned")()
     rows = []
     for number, system in enumerate(systems):
         terms = system.libraries[0]
-        for draw in range(1, draws + 1):
-            clean = simulate(system, parameters={"draw": float(draw)}, times=sample_times(50, 10.0))
+        for draw, length in enumerate(LENGTHS, start=1):
+            clean = simulate(system, parameters={"draw": float(draw)}, times=sample_times(50, length))
             truth = clean.truth(terms)
             assert truth is not None
             for noise in NOISE:

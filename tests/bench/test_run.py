@@ -298,7 +298,7 @@ def test_a_table_shows_the_suite_that_was_run_last_and_where_each_result_came_fr
     assert [result["case"]["settings"] for result in store.results()] == [{"seconds": 0.02}]
     assert count(tmp_path / "store") == 2
     assert store.about()["command"] == "latticebench run s"
-    assert {"commit", "date", "machine", "versions"} == set(next(iter(store.results()))["made"])
+    assert {"commit", "date", "machine", "kernels", "versions"} == set(next(iter(store.results()))["made"])
 
 
 def test_a_noisy_case_holds_its_bound_and_one_without_noise_or_truth_none(tmp_path: Path) -> None:
