@@ -99,7 +99,8 @@ def _by_method(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     rows = []
     pairs = pd.DataFrame({"method": after["method"], "old": _counted(before), "new": _counted(after)})
     # A case in which neither has an error has no truth, or cannot be had.
-    pairs = pairs.loc[np.isfinite(pairs[["old", "new"]]).any(axis=1)].dropna()
+    known = np.isfinite(pairs[["old", "new"]].to_numpy()).any(axis=1)
+    pairs = pairs[known].dropna()
     for method, group in pairs.groupby("method", sort=False):
         old, new = group["old"].to_numpy(), group["new"].to_numpy()
         rows.append((method, len(group), median_ratio(new, old), signed_rank(new, old)))

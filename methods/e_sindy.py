@@ -20,16 +20,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
+from annotated_types import Le
 
-from latticebench.methods.engine.derivatives import LOADS, takes
+from latticebench.methods.engine.bounds import SOME, CountOrNone, Positive, Several
+from latticebench.methods.engine.derivatives import Differentiating
 from latticebench.methods.engine.integrated_equation import integrate_equation
 from latticebench.methods.engine.regression import Regression, rows
 from latticebench.methods.engine.sparse import THRESHOLDS, fitted_optimizer, stlsq_path
-from latticebench.methods.method import Abilities, Fit
-from latticebench.systems.errors import InputError
+from latticebench.methods.method import Fit
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
 
@@ -84,7 +85,7 @@ def bag(regression: Regression, threshold: float, models: int, dropped: int, see
 
 
 @dataclass(frozen=True)
-class ESINDy:
+class ESINDy(Differentiating):
     """pysindy's ensemble of STLSQ; see the module.
 
     Attributes:
@@ -92,36 +93,13 @@ class ESINDy:
         models: number of models of each bagging.
         dropped: number of terms that a model of the library bagging is not offered; 0 leaves that step out.
         inclusion: probability below which a term is dropped (dimensionless).
-        differentiation: see `methods.engine.derivatives`.
-        options: further arguments of the differentiation.
-
-    Raises:
-        InputError: a number is out of range.
     """
 
     name: ClassVar[str] = "e-sindy"
-    thresholds: tuple[float, ...] = THRESHOLDS
-    models: int = 20
-    dropped: int = 1
-    inclusion: float = 0.6
-    differentiation: str = "smoothing-spline"
-    options: dict[str, Any] | None = None
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if not self.thresholds or min(self.thresholds) <= 0 or self.models < 2 or self.dropped < 0:
-            raise InputError(
-                f"method {self.name!r}: it takes at least one threshold above 0 and two models; "
-                "the number of terms dropped is 0 or more"
-            )
-        if not 0 < self.inclusion <= 1:
-            raise InputError(f"method {self.name!r}: inclusion is {self.inclusion!r}; it must be above 0 and at most 1")
-
-    @property
-    def abilities(self) -> Abilities:
-        """Those of the differentiation."""
-        uneven, missing = takes(self.differentiation)
-        return Abilities(uneven=uneven, missing=missing, loads=LOADS)
+    thresholds: Annotated[tuple[Positive, ...], SOME] = THRESHOLDS
+    models: Several = 20
+    dropped: CountOrNone = 1
+    inclusion: Annotated[Positive, Le(1)] = 0.6
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Bag at every threshold that changes what STLSQ finds, and take the one of the least criterion."""

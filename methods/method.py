@@ -1,6 +1,7 @@
 """The protocol of a method, what it can do, and the fit that it returns.
 
-A method is a frozen dataclass whose fields are its settings, with a `name`, `abilities` and
+A method is a frozen dataclass whose fields are its settings (their types say their bounds, see
+`methods.engine.bounds`), with a `name`, `abilities` and
 
     fit(data, library, order, seed) -> Fit
 
@@ -20,10 +21,11 @@ import numbers
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
+from latticebench.methods.engine.bounds import checked
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples, SimulatedSamples
@@ -173,36 +175,31 @@ class Method(Protocol):
         ...
 
 
-def make(kind: type[Method], given: Mapping[str, Any]) -> Method:
+def make(kind: type[Method], given: Mapping[str, Any], *, texts: bool = False) -> Method:
     """Return a method with settings.
 
     Args:
         kind: the method's class.
-        given: settings by name, as values or as texts from a command line; the others have their defaults.
+        given: settings by name; the others have their defaults.
+        texts: the values are texts from a command line.
 
     Raises:
-        InputError: the method has no such setting, or the value is of another type.
+        InputError: the method has no such setting, or a value is of another type or out of range.
     """
-    import pydantic
-
     known = settings(kind)
-    hints = get_type_hints(kind)
     values = {}
     for name, value in given.items():
         if name not in known:
             raise unknown("setting", name, known, f"method {kind.name!r}")
         try:
-            finite = pydantic.ConfigDict(allow_inf_nan=False)
-            adapter: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(hints[name], config=finite)
-            if isinstance(value, str) and value.startswith(("[", "{")):
-                values[name] = adapter.validate_json(value)
-            else:
-                # pydantic would take true for 1.
-                values[name] = adapter.validate_python(value, strict=isinstance(value, bool))
-        except pydantic.ValidationError as error:
-            reason = error.errors()[0]["msg"]
-            raise InputError(f"method {kind.name!r}: setting {name} = {value!r}: {reason}") from None
-    return kind(**values)
+            values[name] = checked(kind, name, value, text=texts)
+        except InputError as error:
+            usual = "" if known[name] is None else f"; it is {known[name]!r} if you leave it out"
+            raise InputError(f"method {kind.name!r}: {error}{usual}") from None
+    try:
+        return kind(**values)
+    except InputError as error:
+        raise InputError(f"method {kind.name!r}: {error}") from None
 
 
 def settings(kind: type[Method]) -> dict[str, Any]:
@@ -223,10 +220,11 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
 
     Raises:
         Skipped: the method declares that it cannot take these data.
-        InputError: the library cannot be evaluated on the data.
+        InputError: a setting is out of range, or the library cannot be evaluated on the data.
         TypeError: the method returned something else than a Fit, or a part of it is of another type.
         ValueError: a coefficient is not finite, or the fit is of another library.
     """
+    _check_settings(method)
     check_fit(data, library, order)
     reason = obstacle(method.abilities, data, library)
     if reason:
@@ -238,6 +236,15 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
     fit = method.fit(shown, library, order, seed)
     _check_returned(fit, library)
     return replace(fit, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
+
+
+def _check_settings(method: Method) -> None:
+    """Refuse what `make` refuses: a method may have been made without it."""
+    if is_dataclass(method):
+        for name, usual in settings(type(method)).items():
+            value = getattr(method, name)
+            if value is not usual:
+                make(type(method), {name: value})
 
 
 def _check_returned(fit: Any, library: Library) -> None:

@@ -13,17 +13,17 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.methods.engine.derivatives import LOADS, takes
+from latticebench.methods.engine.bounds import Positive
+from latticebench.methods.engine.derivatives import Differentiating
 from latticebench.methods.engine.integrated_equation import integrate_equation
 from latticebench.methods.engine.regression import Regression, rows, triangular
 from latticebench.methods.engine.sparse import fitted_optimizer
 from latticebench.methods.method import Abilities, Fit
-from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
 
@@ -56,33 +56,20 @@ def best_subsets(regression: Regression, patience: float, seed: int) -> list[Flo
 
 
 @dataclass(frozen=True)
-class MIOSR:
+class MIOSR(Differentiating):
     """pysindy's MIOSR; see the module.
 
     Attributes:
         patience: seconds after which the solver's best support of one number of terms is taken, proven or not.
-        differentiation: see `methods.engine.derivatives`.
-        options: further arguments of the differentiation.
-
-    Raises:
-        InputError: patience is not above 0.
     """
 
     name: ClassVar[str] = "miosr"
-    patience: float = 10.0
-    differentiation: str = "smoothing-spline"
-    options: dict[str, Any] | None = None
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if not self.patience > 0:
-            raise InputError(f"method {self.name!r}: patience is {self.patience!r}; it must be above 0 seconds")
+    patience: Positive = 10.0
 
     @property
     def abilities(self) -> Abilities:
         """Those of the differentiation; a solver must be installed."""
-        uneven, missing = takes(self.differentiation)
-        return Abilities(uneven=uneven, missing=missing, needs=("gurobipy",), loads=LOADS)
+        return replace(super().abilities, needs=("gurobipy",))
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Find the best support of every number of terms, and take the one of the least criterion."""

@@ -28,17 +28,17 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
-from latticebench.methods.engine.networks.arrays import Arrays, host, one_thread
+from latticebench.methods.engine.bounds import SOME, Count, Positive, Several
+from latticebench.methods.engine.networks.arrays import Arrays, check_device, host, one_thread
 from latticebench.methods.engine.networks.history import HistoryLog
 from latticebench.methods.engine.networks.members import best_member, member_draws, spread
 from latticebench.methods.engine.networks.projection import Curve, CurveSettings, ProjectedStep, project, projected_step
 from latticebench.methods.engine.networks.sizes import estimate_sizes
 from latticebench.methods.method import Abilities, Fit, History, Smooth
-from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
 
@@ -68,35 +68,22 @@ class PIELM:
             ones: the matrices outgrow its cache).
 
     Raises:
-        InputError: a number is unsound.
+        InputError: there is no such device.
     """
 
     name: ClassVar[str] = "pielm"
-    width: int = 80
-    bandwidth: float = 3.0
-    collocation: int = 201
-    weights: tuple[float, ...] = (1e-4, 1e-3, 0.01, 0.1, 1.0, 10.0, 100.0)
-    iterations: int = 8
-    tolerance: float = 1e-6
+    width: Count = 80
+    bandwidth: Positive = 3.0
+    collocation: Several = 201
+    weights: Annotated[tuple[Positive, ...], SOME] = (1e-4, 1e-3, 0.01, 0.1, 1.0, 10.0, 100.0)
+    iterations: Count = 8
+    tolerance: Positive = 1e-6
     device: str = "cpu"
-    members: int = 1
+    members: Count = 1
 
     def __post_init__(self) -> None:
-        """Check the settings."""
-        for name, least in (("width", 1), ("collocation", 2), ("iterations", 1), ("members", 1)):
-            if getattr(self, name) < least:
-                raise InputError(
-                    f"method {self.name!r}: setting {name} = {getattr(self, name)!r}; it must be at least {least}"
-                )
-        for name, values in (
-            ("bandwidth", (self.bandwidth,)),
-            ("tolerance", (self.tolerance,)),
-            ("weights", self.weights),
-        ):
-            if not values or not all(math.isfinite(value) and value > 0 for value in values):
-                raise InputError(
-                    f"method {self.name!r}: setting {name} = {getattr(self, name)!r}; it takes numbers above 0"
-                )
+        """Check the device."""
+        check_device(self.device)
 
     @property
     def abilities(self) -> Abilities:

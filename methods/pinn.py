@@ -12,7 +12,6 @@ of collocation points, initial weights or the scaling of time; the defaults of `
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,14 +19,14 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from latticebench.methods.engine.networks.arrays import Arrays, host, one_thread
+from latticebench.methods.engine.bounds import Count, CountOrNone, Positive, Several
+from latticebench.methods.engine.networks.arrays import Arrays, check_device, host, one_thread
 from latticebench.methods.engine.networks.descent import adam, lbfgs, lockstep
 from latticebench.methods.engine.networks.history import HistoryLog
 from latticebench.methods.engine.networks.loss import JointLoss, LossSettings, NetworkLoss
 from latticebench.methods.engine.networks.members import best_member, member_draws, spread
 from latticebench.methods.engine.networks.sizes import estimate_sizes
 from latticebench.methods.method import Abilities, Fit, History
-from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
 
@@ -64,39 +63,28 @@ class PINN:
             NumPy arrays one trains after the other, since a batch of eight cost 1.26 there.
 
     Raises:
-        InputError: a number is too small.
+        InputError: there is no such device.
     """
 
     name: ClassVar[str] = "pinn"
-    layers: int = 3
-    width: int = 40
+    layers: Count = 3
+    width: Count = 40
     mirror: bool = False
-    collocation: int = 201
-    data_weight: float = 100.0
-    frequency: float = 3.0
-    coefficient_scale: float = 10.0
-    adam_steps: int = 1000
-    learning_rate: float = 3e-3
-    lbfgs_steps: int = 7000
-    memory: int = 20
-    record: int = 100
+    collocation: Several = 201
+    data_weight: Positive = 100.0
+    frequency: Positive = 3.0
+    coefficient_scale: Positive = 10.0
+    adam_steps: CountOrNone = 1000
+    learning_rate: Positive = 3e-3
+    lbfgs_steps: CountOrNone = 7000
+    memory: Count = 20
+    record: Count = 100
     device: str = "cpu"
-    members: int = 1
+    members: Count = 1
 
     def __post_init__(self) -> None:
-        """Check the settings."""
-        for name, least in (
-            ("layers", 1), ("width", 1), ("collocation", 2), ("adam_steps", 0), ("lbfgs_steps", 0), ("memory", 1),
-            ("record", 1), ("members", 1),
-        ):  # fmt: skip
-            if getattr(self, name) < least:
-                raise InputError(
-                    f"method {self.name!r}: setting {name} = {getattr(self, name)!r}; it must be at least {least}"
-                )
-        for name in ("data_weight", "frequency", "coefficient_scale", "learning_rate"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"method {self.name!r}: setting {name} = {value!r}; it must be a number above 0")
+        """Check the device."""
+        check_device(self.device)
 
     @property
     def abilities(self) -> Abilities:

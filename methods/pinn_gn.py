@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
+from latticebench.methods.engine.bounds import Count, CountOrNone, Positive
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.methods.engine.networks.arrays import one_thread
 from latticebench.methods.engine.networks.hidden_layer import REDUNDANT, Activation, draw_layer
@@ -84,36 +85,23 @@ class PINNGaussNewton:
         precision: it is also large enough when the standard errors are below this share of the coefficients.
         members: number of networks trained on samples drawn from the fit; 0 for none. `found` has the standard
             deviation of each coefficient over them, and the half-width of the interval of 95 % that follows from it.
-
-    Raises:
-        InputError: a number is unsound.
     """
 
     name: ClassVar[str] = "pinn-gn"
     activation: Activation = "sine"
-    width: int = 0
+    width: CountOrNone = 0
     train: bool = True
-    bandwidth: float = 4.0
-    stages: int = 24
-    steps: int = 6
-    tolerance: float = 0.05
-    precision: float = 1e-7
-    members: int = 0
+    bandwidth: Positive = 4.0
+    stages: Count = 24
+    steps: Count = 6
+    tolerance: Positive = 0.05
+    precision: Positive = 1e-7
+    members: CountOrNone = 0
 
     def __post_init__(self) -> None:
-        """Check the settings."""
-        for name, least in (("width", 0), ("stages", 1), ("steps", 1), ("members", 0)):
-            if getattr(self, name) < least:
-                raise InputError(
-                    f"method {self.name!r}: setting {name} = {getattr(self, name)!r}; it must be at least {least}"
-                )
+        """Check what no bound says."""
         if self.members == 1:
-            raise InputError(f"method {self.name!r}: setting members = 1; one has no spread, take 0, or 2 and more")
-        for name in ("bandwidth", "tolerance", "precision"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(
-                    f"method {self.name!r}: setting {name} = {getattr(self, name)!r}; it takes a number above 0"
-                )
+            raise InputError("setting members = 1: one has no spread, take 0, or 2 and more")
 
     @property
     def abilities(self) -> Abilities:

@@ -4,6 +4,8 @@
 regularised regression (Zheng et al., IEEE Access 7, 1404 (2019)), debiased on its support as STLSQ is; `pysindy`: any
 other of pysindy's optimisers by its name.
 
+All have the settings and abilities of `methods.engine.derivatives.Differentiating`, too.
+
 Rows are scaled by the RMS of the derivative and columns by the RMS of their term, so that a threshold is a share: a
 term below `threshold` times the derivative's RMS is dropped, whatever the units and the number of samples.
 """
@@ -12,42 +14,33 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from latticebench.methods.engine.derivatives import LOADS, takes
+from latticebench.methods.engine.bounds import Count, NotNegative, Positive
+from latticebench.methods.engine.derivatives import Differentiating
 from latticebench.methods.engine.regression import Regression, rows
-from latticebench.methods.engine.sparse import sparse_fit
-from latticebench.methods.method import Abilities, Fit
+from latticebench.methods.engine.sparse import make_optimizer, sparse_fit
+from latticebench.methods.method import Fit
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
 
 
 @dataclass(frozen=True)
-class STLSQ:
+class STLSQ(Differentiating):
     """pysindy's STLSQ.
 
     Attributes:
         threshold: share of the derivative's RMS below which a term is dropped (dimensionless).
         alpha: ridge penalty; 0, because pysindy's default of 0.05 biases the selection.
         max_iter: maximum number of rounds of thresholding.
-        differentiation: see `methods.engine.derivatives`.
-        options: further arguments of the differentiation.
     """
 
     name: ClassVar[str] = "stlsq"
-    threshold: float = 0.05
-    alpha: float = 0.0
-    max_iter: int = 20
-    differentiation: str = "smoothing-spline"
-    options: dict[str, Any] | None = None
-
-    @property
-    def abilities(self) -> Abilities:
-        """Those of the differentiation."""
-        uneven, missing = takes(self.differentiation)
-        return Abilities(uneven=uneven, missing=missing, loads=LOADS)
+    threshold: NotNegative = 0.05
+    alpha: NotNegative = 0.0
+    max_iter: Count = 20
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Threshold and refit until the support stays the same."""
@@ -57,7 +50,7 @@ class STLSQ:
 
 
 @dataclass(frozen=True)
-class SR3:
+class SR3(Differentiating):
     """pysindy's SR3, with the coefficients refitted on the support it finds.
 
     Attributes:
@@ -67,24 +60,14 @@ class SR3:
         relax_coeff_nu: the relaxation.
         max_iter: maximum number of iterations.
         tol: change of the coefficients at which to stop, see pysindy.
-        differentiation: see `methods.engine.derivatives`.
-        options: further arguments of the differentiation.
     """
 
     name: ClassVar[str] = "sr3"
-    regularizer: str = "L0"
-    reg_weight_lam: float = 0.00125
-    relax_coeff_nu: float = 1.0
-    max_iter: int = 1000
-    tol: float = 1e-8
-    differentiation: str = "smoothing-spline"
-    options: dict[str, Any] | None = None
-
-    @property
-    def abilities(self) -> Abilities:
-        """Those of the differentiation."""
-        uneven, missing = takes(self.differentiation)
-        return Abilities(uneven=uneven, missing=missing, loads=LOADS)
+    regularizer: Literal["L0", "L1", "L2"] = "L0"
+    reg_weight_lam: NotNegative = 0.00125
+    relax_coeff_nu: Positive = 1.0
+    max_iter: Count = 1000
+    tol: Positive = 1e-8
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Minimise the relaxed objective, then refit on the support."""
@@ -97,27 +80,23 @@ class SR3:
 
 
 @dataclass(frozen=True)
-class PySINDy:
+class PySINDy(Differentiating):
     """Any of pysindy's optimisers.
 
     Attributes:
         optimizer: class name of the optimiser, such as SSR, FROLS or MIOSR.
         arguments: its arguments.
-        differentiation: see `methods.engine.derivatives`.
-        options: further arguments of the differentiation.
     """
 
     name: ClassVar[str] = "pysindy"
     optimizer: str = "FROLS"
     arguments: dict[str, Any] | None = None
-    differentiation: str = "smoothing-spline"
-    options: dict[str, Any] | None = None
 
-    @property
-    def abilities(self) -> Abilities:
-        """Those of the differentiation."""
-        uneven, missing = takes(self.differentiation)
-        return Abilities(uneven=uneven, missing=missing, loads=LOADS)
+    def __post_init__(self) -> None:
+        """Check the optimiser where it is not the usual one."""
+        super().__post_init__()
+        if (self.optimizer, self.arguments) != ("FROLS", None):
+            make_optimizer(self.optimizer, self.arguments or {})
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Fit the scaled rows with the optimiser."""

@@ -28,11 +28,12 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from latticebench.methods.engine.derivatives import KINDS, LOADS, takes
+from latticebench.methods.engine.bounds import SOME, Count, Positive, Several
+from latticebench.methods.engine.derivatives import LOADS, Differentiation, takes
 from latticebench.methods.engine.integrated_equation import (
     PRICE,
     SPAN,
@@ -43,7 +44,7 @@ from latticebench.methods.engine.integrated_equation import (
 from latticebench.methods.engine.regression import Regression, rows, triangular
 from latticebench.methods.engine.sparse import THRESHOLDS, fitted_optimizer, sparse_fit, stlsq_path
 from latticebench.methods.method import Abilities, Fit
-from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
 
@@ -51,8 +52,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from numpy import ndarray
 
-OPTIMIZERS = ("STLSQ", "SR3", "SSR", "FROLS", "ensemble")
-DIFFERENTIATIONS = ("smoothing-spline", "spline", "FiniteDifference", "SmoothedFiniteDifference", *KINDS)
+Optimizer = Literal["STLSQ", "SR3", "SSR", "FROLS", "ensemble"]
 # The rows that a bagged model draws: more cost time and change nothing.
 MOST_DRAWN = 1000
 
@@ -78,7 +78,7 @@ class SparseModel:
 
     Attributes:
         rows: on which it was found.
-        optimizer: that found it, one of OPTIMIZERS.
+        optimizer: that found it, an `Optimizer`.
         knob: the threshold (dimensionless), or the number of terms for SSR and FROLS.
         coefficients: in the data's units (terms,).
     """
@@ -160,7 +160,7 @@ def path(
 
     Args:
         regression: the rows.
-        optimizer: one of OPTIMIZERS.
+        optimizer: an `Optimizer`.
         thresholds: shares of the derivative's RMS (dimensionless), of all but SSR and FROLS.
         models: number of models that are bagged.
         seed: of the draws.
@@ -221,41 +221,19 @@ class SINDyTuned:
         price: of a term in bic and residual, in multiples of log n (dimensionless).
         models: number of bagged models.
         folds: number of parts of the record for cv.
-
-    Raises:
-        InputError: a name is unknown, or a number is out of range.
     """
 
     name: ClassVar[str] = "sindy-tuned"
-    optimizers: tuple[str, ...] = ("STLSQ", "SR3", "SSR", "FROLS")
-    differentiations: tuple[str, ...] = (
+    optimizers: Annotated[tuple[Optimizer, ...], SOME] = ("STLSQ", "SR3", "SSR", "FROLS")
+    differentiations: Annotated[tuple[Differentiation, ...], SOME] = (
         "smoothing-spline", "spline", "FiniteDifference", "SmoothedFiniteDifference", "finite_difference", "spectral",
     )  # fmt: skip
     criterion: Literal["bic", "cv", "residual"] = "bic"
-    thresholds: tuple[float, ...] = THRESHOLDS
-    span: float = SPAN
-    price: float = PRICE
-    models: int = 20
-    folds: int = 5
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        for optimizer in self.optimizers:
-            if optimizer not in OPTIMIZERS:
-                raise unknown("optimizer", optimizer, OPTIMIZERS, f"method {self.name!r}")
-        for kind in self.differentiations:
-            if kind not in DIFFERENTIATIONS:
-                raise unknown("differentiation", kind, DIFFERENTIATIONS, f"method {self.name!r}")
-        numbers = (self.span, self.price, *self.thresholds)
-        if not (self.optimizers and self.differentiations and self.thresholds and all(one > 0 for one in numbers)):
-            raise InputError(
-                f"method {self.name!r}: it takes at least one optimizer, differentiation and threshold; "
-                "thresholds, span and price must be above 0"
-            )
-        if self.criterion not in ("bic", "cv", "residual"):
-            raise unknown("criterion", self.criterion, ("bic", "cv", "residual"), f"method {self.name!r}")
-        if self.models < 1 or self.folds < 2:
-            raise InputError(f"method {self.name!r}: models must be at least 1, folds at least 2")
+    thresholds: Annotated[tuple[Positive, ...], SOME] = THRESHOLDS
+    span: Positive = SPAN
+    price: Positive = PRICE
+    models: Count = 20
+    folds: Several = 5
 
     @property
     def abilities(self) -> Abilities:

@@ -17,10 +17,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Ge, Le
 
+from latticebench.methods.engine.bounds import Count, NotNegative, Positive
 from latticebench.methods.engine.collocation import Curves, NormalEquations, normal_equations, objective, place_curves
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.methods.engine.record import prepare, without_halves
@@ -90,12 +92,12 @@ class Splines:
     """
 
     name: ClassVar[str] = "splines"
-    degree: int = 7
-    density: float = 1.5
-    stages: int = 16
-    steps: int = 4
-    tolerance: float = 0.05
-    rise: float = 0.003
+    degree: Annotated[int, Ge(3), Le(20)] = 7
+    density: Positive = 1.5
+    stages: Count = 16
+    steps: Count = 4
+    tolerance: Positive = 0.05
+    rise: NotNegative = 0.003
 
     @property
     def abilities(self) -> Abilities:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from latticebench.methods.engine.bounds import Count, Positive
 from latticebench.methods.engine.record import Record, prepare, without_halves
 from latticebench.methods.engine.shooting import Solution, State, maximise
 from latticebench.methods.engine.starts import GRADUAL_PIECES, approach, following, from_weak_form, guess
@@ -49,8 +50,8 @@ class Trajectory:
 
     name: ClassVar[str] = "trajectory"
     select: bool = False
-    steps: int = 40
-    tolerance: float = 1e-3
+    steps: Count = 40
+    tolerance: Positive = 1e-3
 
     @property
     def abilities(self) -> Abilities:

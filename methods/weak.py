@@ -15,12 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
+from annotated_types import Ge, Le
 
+from latticebench.methods.engine.bounds import Count, Positive
 from latticebench.methods.engine.errors_in_variables import ROUNDS, Estimate, Selection, by_criterion, sparse_estimate
-from latticebench.methods.engine.sparse import sparse_fit
+from latticebench.methods.engine.sparse import make_optimizer, sparse_fit
 from latticebench.methods.engine.weak_form import HALF_WIDTH, POWER, WeakForm
 from latticebench.methods.method import Abilities, Fit
 from latticebench.systems.errors import InputError
@@ -29,6 +31,9 @@ from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
     from numpy import ndarray
+
+# Ways of selecting terms that are not pysindy's.
+OWN = ("bic", "none")
 
 
 @dataclass(frozen=True)
@@ -47,9 +52,16 @@ class Weak:
     name: ClassVar[str] = "weak"
     optimizer: str = "bic"
     arguments: dict[str, Any] | None = None
-    half_width: float = HALF_WIDTH
-    power: int = POWER
-    rounds: int = ROUNDS
+    half_width: Positive = HALF_WIDTH
+    power: Annotated[int, Ge(4), Le(100)] = POWER
+    rounds: Count = ROUNDS
+
+    def __post_init__(self) -> None:
+        """Check the optimiser."""
+        if self.optimizer not in OWN:
+            make_optimizer(self.optimizer, self.arguments or {})
+        elif self.arguments:
+            raise InputError(f"optimizer {self.optimizer!r} takes no arguments; leave them out")
 
     @property
     def abilities(self) -> Abilities:
@@ -60,10 +72,8 @@ class Weak:
         """Estimate all coefficients, select terms, and estimate the coefficients of those again.
 
         Raises:
-            InputError: a setting is out of range, there are too few samples, or the covariance is not positive.
+            InputError: there are too few samples, or the covariance is not positive.
         """
-        if not (self.half_width > 0 and self.power >= 4 and self.rounds >= 1):
-            raise InputError("method 'weak': half_width must be above 0, power at least 4, rounds at least 1")
         forms = [WeakForm(samples, library, order, self.half_width, self.power) for samples in data]
         found, support = sparse_estimate(forms, self.rounds, seed, self._selection(seed))
         problems = []

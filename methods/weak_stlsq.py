@@ -21,10 +21,12 @@ import itertools
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Ge, Le, Lt
 
+from latticebench.methods.engine.bounds import SOME, Count, Positive
 from latticebench.methods.engine.inputs import inputs
 from latticebench.methods.engine.integrated_equation import integrate_equation, smooth_curves
 from latticebench.methods.engine.regression import Regression
@@ -86,27 +88,14 @@ class WeakSTLSQ:
         finer: points of the grid in each interval between samples, to choose from; 1 for the samples themselves.
         domains: number of windows.
         power: p of the test functions.
-
-    Raises:
-        InputError: a number is out of range.
     """
 
     name: ClassVar[str] = "weak-stlsq"
-    thresholds: tuple[float, ...] = THRESHOLDS
-    widths: tuple[float, ...] = (0.05, 0.1, 0.2)
-    finer: tuple[int, ...] = (1, 4)
-    domains: int = 100
-    power: int = 4
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        positive = (*self.thresholds, *self.widths, *self.finer, self.domains)
-        if not (self.thresholds and self.widths and self.finer and min(positive) > 0):
-            raise InputError(
-                f"method {self.name!r}: it takes at least one threshold, width and grid; they must be above 0"
-            )
-        if max(self.widths) >= 0.5 or self.power < 2:
-            raise InputError(f"method {self.name!r}: widths must be below 0.5, the power at least 2")
+    thresholds: Annotated[tuple[Positive, ...], SOME] = THRESHOLDS
+    widths: Annotated[tuple[Annotated[Positive, Lt(0.5)], ...], SOME] = (0.05, 0.1, 0.2)
+    finer: Annotated[tuple[Count, ...], SOME] = (1, 4)
+    domains: Count = 100
+    power: Annotated[int, Ge(2), Le(100)] = 4
 
     @property
     def abilities(self) -> Abilities:

@@ -63,7 +63,7 @@ def fit(
     check_places([*files, system, method], json=json_out)
     # What a file of the user's prints is for people, not for a program that reads the result.
     with redirect_stdout(sys.stderr):
-        chosen = make(methods.find(method), pairs(given))
+        chosen = make(methods.find(method), pairs(given), texts=True)
         _, candidates, order = asked(system, library, terms, order)
     data = read_all(files, ends)
     with (

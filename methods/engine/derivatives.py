@@ -11,11 +11,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from latticebench.methods.engine.bsplines import BSplines
+from latticebench.methods.method import Abilities
 from latticebench.systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
@@ -26,8 +27,12 @@ if TYPE_CHECKING:
 DEGREE = 5
 # A dense eigenvalue problem of this size takes about a second.
 MAX_COEFFICIENTS = 1000
-# The kinds of the derivative package; most need their options.
-KINDS = ("finite_difference", "kalman", "kernel", "savitzky_golay", "spectral", "spline", "trend_filtered")
+Ours = Literal["smoothing-spline", "spline"]
+PySINDys = Literal["FiniteDifference", "SmoothedFiniteDifference"]
+# Of the derivative package; most need their options.
+Kind = Literal["finite_difference", "kalman", "kernel", "savitzky_golay", "spectral", "trend_filtered"]
+Differentiation = Literal[Ours, PySINDys, Kind]
+KINDS: tuple[str, ...] = get_args(Kind)
 # What a differentiation imports; a method that differentiates names it in its abilities.
 LOADS = ("pysindy", "scipy.interpolate", "scipy.linalg", "scipy.optimize")
 
@@ -43,7 +48,53 @@ class Smoothed:
 
 def takes(kind: str) -> tuple[bool, bool]:
     """Return whether a kind of differentiation takes uneven times, and whether it takes missing values."""
-    return kind in ("smoothing-spline", "spline", "FiniteDifference"), kind in ("smoothing-spline", "spline")
+    return kind in (*get_args(Ours), "FiniteDifference"), kind in get_args(Ours)
+
+
+@dataclass(frozen=True)
+class Differentiating:
+    """The settings of a method that differentiates the samples.
+
+    Attributes:
+        differentiation: the kind, see the module.
+        options: further arguments of pysindy's kinds.
+
+    Raises:
+        InputError: there are options that the kind does not take, or it lacks some.
+    """
+
+    differentiation: Differentiation = "smoothing-spline"
+    options: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the options."""
+        check_options(self.differentiation, self.options)
+
+    @property
+    def abilities(self) -> Abilities:
+        """Those of the differentiation."""
+        uneven, missing = takes(self.differentiation)
+        return Abilities(uneven=uneven, missing=missing, loads=LOADS)
+
+
+def check_options(kind: str, options: Mapping[str, Any] | None) -> None:
+    """Refuse options that a kind of differentiation does not take, as far as it says so without samples.
+
+    Raises:
+        InputError: there is no such kind, or its options are wrong.
+    """
+    if kind not in get_args(Differentiation):
+        raise unknown("differentiation", kind, get_args(Differentiation))
+    if kind in get_args(Ours):
+        if options:
+            raise InputError(f"differentiation {kind!r} takes no options")
+    elif options or kind in KINDS:
+        from derivative.differentiation import methods
+
+        try:
+            (methods[kind] if kind in KINDS else _pysindys(kind))(**copy.deepcopy(dict(options or {})))
+        except Exception as error:
+            raise _refused(kind, options or {}, error) from error
 
 
 def differentiate(
@@ -72,10 +123,9 @@ def differentiate(
             real.first + 1j * imaginary.first,
             real.second + 1j * imaginary.second,
         )
-    if kind not in ("smoothing-spline", "spline"):
+    check_options(kind, options)
+    if kind not in get_args(Ours):
         return _pysindy(t, field, kind, options or {})
-    if options:
-        raise InputError(f"differentiation {kind!r} takes no options")
     if not np.any(np.isnan(field)):
         return _spline(t, field, smooth=kind == "smoothing-spline")
     # With gaps every site has times of its own; a value that was not seen stays NaN.
@@ -164,27 +214,26 @@ def _smoothing_coefficients(x: ndarray, field: ndarray, splines: BSplines) -> nd
 def _pysindy(t: ndarray, field: ndarray, kind: str, options: Mapping[str, Any]) -> Smoothed:
     import warnings
 
-    import pysindy
-
     if len(t) < 3:
         raise InputError(f"differentiation {kind!r} needs at least 3 samples, there are {len(t)}; give more")
-    if kind in ("FiniteDifference", "SmoothedFiniteDifference"):
-        make = getattr(pysindy, kind)
-    elif kind in KINDS:
-        make = pysindy.SINDyDerivative
-        options = {"kind": kind, **options}
-    else:
-        raise unknown(
-            "differentiation",
-            kind,
-            ["smoothing-spline", "spline", "FiniteDifference", "SmoothedFiniteDifference", *KINDS],
-        )
+    make, given = _pysindys(kind), {"kind": kind, **options} if kind in KINDS else options
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             # Copies, because pysindy writes into tables among its options.
-            first = np.asarray(make(**copy.deepcopy(options))(field, t))
-            second = np.asarray(make(**copy.deepcopy(options))(first, t))
+            first = np.asarray(make(**copy.deepcopy(given))(field, t))
+            second = np.asarray(make(**copy.deepcopy(given))(first, t))
     except Exception as error:
-        raise InputError(f"differentiation {kind!r} with {dict(options)}: {error}") from error
+        raise _refused(kind, options, error) from error
     return Smoothed(field, first, second)
+
+
+def _pysindys(kind: str) -> Any:
+    """Return pysindy's class of a kind of differentiation."""
+    import pysindy
+
+    return getattr(pysindy, "SINDyDerivative" if kind in KINDS else kind)
+
+
+def _refused(kind: str, options: Mapping[str, Any], error: Exception) -> InputError:
+    return InputError(f"differentiation {kind!r} with {dict(options)}: {error}")

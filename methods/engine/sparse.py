@@ -39,6 +39,32 @@ def seeded(seed: int) -> Iterator[None]:
         np.random.set_state(state)  # noqa: NPY002
 
 
+def make_optimizer(optimizer: str, arguments: Mapping[str, Any]) -> Any:
+    """Make one of pysindy's optimisers.
+
+    Args:
+        optimizer: class name of the optimiser, such as STLSQ or FROLS.
+        arguments: its arguments.
+
+    Raises:
+        InputError: there is no such optimiser, or it refuses its arguments.
+    """
+    import pysindy.optimizers
+    from pysindy.optimizers import BaseOptimizer
+
+    known = {
+        name for name, kind in vars(pysindy.optimizers).items()
+        if isinstance(kind, type) and issubclass(kind, BaseOptimizer) and kind is not BaseOptimizer
+    }  # fmt: skip
+    if optimizer not in known:
+        error = unknown("optimizer", optimizer, known)
+        raise InputError(f"{error}; pysindy leaves out those whose solver is not installed (such as cvxpy)")
+    try:
+        return getattr(pysindy.optimizers, optimizer)(**arguments)
+    except Exception as error:
+        raise _refused(optimizer, arguments, error) from error
+
+
 def fitted_optimizer(regression: Regression, optimizer: str, arguments: Mapping[str, Any], seed: int) -> Any:
     """Make one of pysindy's optimisers and fit it to the scaled rows of a regression.
 
@@ -54,26 +80,22 @@ def fitted_optimizer(regression: Regression, optimizer: str, arguments: Mapping[
     Raises:
         InputError: there is no such optimiser, or it refuses its arguments or the rows.
     """
-    import pysindy.optimizers
-    from pysindy.optimizers import BaseOptimizer
-
-    known = {
-        name for name, kind in vars(pysindy.optimizers).items()
-        if isinstance(kind, type) and issubclass(kind, BaseOptimizer) and kind is not BaseOptimizer
-    }  # fmt: skip
-    if optimizer not in known:
-        error = unknown("pysindy optimiser", optimizer, known)
-        raise InputError(f"{error}; pysindy leaves out those whose solver is not installed (such as cvxpy)")
     height = np.sqrt(np.mean(regression.target**2)) or 1.0
     try:
         # A solver may print its licence, which is no part of the output.
         with warnings.catch_warnings(), seeded(seed), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            return getattr(pysindy.optimizers, optimizer)(**arguments).fit(
+            return make_optimizer(optimizer, arguments).fit(
                 regression.design / (regression.scales * height), regression.target[:, None] / height
             )
+    except InputError:
+        raise
     except Exception as error:
-        raise InputError(f"pysindy's {optimizer} with {dict(arguments)}: {error}") from error
+        raise _refused(optimizer, arguments, error) from error
+
+
+def _refused(optimizer: str, arguments: Mapping[str, Any], error: Exception) -> InputError:
+    return InputError(f"pysindy's {optimizer} with {dict(arguments)}: {error}")
 
 
 def sparse_fit(

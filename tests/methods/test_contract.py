@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import itertools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -162,17 +164,49 @@ def test_two_trajectories_are_fitted_together(name: str, phi4: SimulatedSamples)
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_an_unknown_setting_and_a_value_of_another_type_are_refused_by_name(name: str) -> None:
-    kind = methods.find(name)
+def test_an_unknown_setting_is_refused_by_name(name: str) -> None:
     with pytest.raises(InputError, match="unknown setting 'thresold'"):
-        make(kind, {"thresold": 1})
-    numbers = [key for key, value in settings(kind).items() if isinstance(value, float)]
-    for key in numbers:
-        with pytest.raises(InputError, match=f"setting {key} = True"):
-            make(kind, {key: True})
-    for key in numbers[:1]:
-        with pytest.raises(InputError, match=f"setting {key} = 'many'"):
-            make(kind, {key: "many"})
+        make(methods.find(name), {"thresold": 1})
+
+
+# What no setting of any method may be; a text may also be typed on the command line.
+WRONG: tuple[object, ...] = (
+    -1, -1e-300, math.nan, math.inf, -math.inf, 10**400, True, "", "nope", " ", [], [-1], [True], [math.nan], ["nope"],
+    [[]], {"nope": 1}, {"": math.nan}, {"threshold": -math.inf}, datetime.date(1979, 5, 27), b"x", None,
+)  # fmt: skip
+WRONG_TEXTS = ("", " ", "-1", "nan", "inf", "-inf", "1e999", "nope", "[", "[-1]", "[NaN]", "{", "[" * 9999, "9" * 9999)
+
+
+def allowed(default: object, value: object) -> bool:
+    """Whether a value is right after all: a boolean has no bounds, and None stands for no options."""
+    return (isinstance(default, bool) and value in (True, "1")) or (default is None and value is None)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_setting_refuses_what_is_out_of_range_or_of_another_type_by_its_name(name: str) -> None:
+    kind = methods.find(name)
+    for key, default in settings(kind).items():
+        for value in WRONG:
+            if not allowed(default, value):
+                with pytest.raises(InputError) as refusal:
+                    make(kind, {key: value})
+                assert key in str(refusal.value) or "with {" in str(refusal.value), (key, value, str(refusal.value))
+        for text in WRONG_TEXTS:
+            with pytest.raises(InputError):
+                make(kind, {key: text}, texts=True)
+        # What is right is kept, as a value of a suite and as a text that is typed.
+        assert getattr(make(kind, {key: default}), key) == default
+        if isinstance(default, (bool, int, float, str)):
+            assert getattr(make(kind, {key: str(default)}, texts=True), key) == default
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_that_was_made_without_a_check_is_checked_before_it_fits(name: str, phi4: SimulatedSamples) -> None:
+    kind = methods.find(name)
+    for key, default in settings(kind).items():
+        if isinstance(default, (int, float)) and not isinstance(default, bool):
+            with pytest.raises(InputError, match=f"setting {key} = -1"):
+                solve(kind(**{key: -1}), [phi4], systems.find("phi4").library("lib1"), 2, seed=1)
 
 
 def test_a_library_that_the_data_cannot_serve_is_refused_with_the_reason(phi4: SimulatedSamples) -> None:

@@ -181,8 +181,8 @@ def test_every_differentiation_that_may_be_asked_for_works_with_its_options() ->
 @pytest.mark.parametrize(
     ("setting", "value", "reason"),
     [
-        ("optimizers", ["STLQ"], "did you mean 'STLSQ'"),
-        ("differentiations", ["splin"], "did you mean 'spline'"),
+        ("optimizers", ["STLQ"], r"optimizers\[0\] = .*'STLSQ'"),
+        ("differentiations", ["splin"], r"differentiations\[0\] = .*'spline'"),
         ("criterion", "aic", "criterion"),
         ("thresholds", [0.0], "above 0"),
         ("folds", 1, "folds"),

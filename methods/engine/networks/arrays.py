@@ -6,6 +6,7 @@ axis in front: of members, several networks that are computed together.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,16 @@ if TYPE_CHECKING:
 
     # A NumPy array on the processor, a torch tensor elsewhere.
     Array = Any
+
+
+def check_device(device: str) -> None:
+    """Make sure that this is the name of a device; whether the machine has it is known where it is used.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not re.fullmatch(r"(cpu|cuda|mps|xpu|hpu)(:\d{1,3})?", device):
+        raise InputError(f"device {device!r}: there is no such device; use cpu, or a name of torch's such as cuda:1")
 
 
 class Arrays:
