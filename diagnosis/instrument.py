@@ -59,8 +59,10 @@ def step_of(values: Float[ndarray, " values"]) -> float:
     digit = _last_digit(levels)
     # Equal but for rounding of the arithmetic.
     levels = levels[np.concatenate([[True], np.diff(levels) > max(digit / 2, 1e-9 * float(np.max(abs(levels))))])]
+    if len(levels) < FEWEST_LEVELS:
+        return 0.0
     step = next((step for step in _steps(levels, digit) if step > 0), digit)
-    if step <= 0 or len(levels) < FEWEST_LEVELS:
+    if step <= 0:
         return 0.0
     if np.ptp(levels) > PRINTED * step and step < COARSE * min(_scales(np.arange(float(len(values))), values)):
         return 0.0

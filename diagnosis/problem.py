@@ -42,6 +42,8 @@ HARMONICS = 8
 ROUNDED = 0.5
 # A stretch that lasts so many times as long as its samples ask for holds a gap.
 GAP = 2.0
+# In typical times between readings; each is some steps of the integrator.
+LONGEST_GAP = 1000.0
 # So many sensors are looked at for steps before it is taken that there are none.
 FEW_SENSORS = 4
 
@@ -119,8 +121,9 @@ class Problem:
         """Return the problem of finding what an equation lacks of recordings.
 
         Raises:
-            InputError: the chain is shorter than the stencil.
+            InputError: the chain is shorter than the stencil, or there is a gap that nothing can be followed through.
         """
+        _check_gaps(data)
         longest = max(data, key=lambda one: len(one.t))
         spectrum = Spectrum.of(longest)
         top = _top(spectrum, longest)
@@ -130,12 +133,14 @@ class Problem:
         reach = (WIDE, WIDE) if first.ends == "unknown" and first.sites >= LONG_CHAIN else (0, 0)
         plain = Dynamics(declared.terms, order, first.is_complex, first.sites, first.ends, least_reach=reach)
         if first.ends == "unknown":
-            plain = replace(plain, least_reach=plain.reach)
+            # Effects look as far to both sides as declared terms to one, where the chain is long enough.
+            far = max(plain.reach)
+            plain = replace(plain, least_reach=(far, far) if first.sites > 2 * far else plain.reach)
         states = [_states(one, order) for one in data]
         records, splines = zip(
             *(_record(one, plain, both) for one, both in zip(data, states, strict=True)), strict=True
         )
-        widest = max(plain.reach) if first.ends == "unknown" else first.sites - 1
+        widest = min(plain.reach) if first.ends == "unknown" else first.sites - 1
         levels = records[0].value.shape[1]
         moving = tuple(range(first.sites)[plain.moving])
         chain = Chain(first.sites, order, first.is_complex, levels, first.ends, moving, widest)
@@ -262,6 +267,20 @@ def _top(spectrum: Spectrum, samples: Samples) -> float:
     return max(float(np.max(spectrum.peaks, initial=0.0)), lowest)
 
 
+def _check_gaps(data: Sequence[Samples]) -> None:
+    """Refuse gaps that no motion is followed through, and recordings whose times have different units."""
+    longest = max(data, key=lambda one: len(one.t))
+    usual = float(np.median(np.diff(longest.t)))
+    for one in data:
+        row = int(np.argmax(np.diff(one.t)))
+        gap = float(one.t[row + 1] - one.t[row])
+        if gap > LONGEST_GAP * usual:
+            raise InputError(
+                f"{one.source}: rows {row + 1} and {row + 2}: {gap:g} between two readings, where {usual:g} is usual; "
+                "cut the recording there into trajectories, or give all times in one unit"
+            )
+
+
 def thinned(samples: Samples, top: float) -> Samples:
     """Return every k-th sample of one that is read far more often than it moves, and at least `LONG` / 2 of them."""
     step = float(np.median(np.diff(samples.t)))
@@ -351,6 +370,9 @@ def regressed(problem: Problem) -> tuple[float, ...]:
     """Return the declared coefficients that carry the smoothed states over a quarter of the shortest period.
 
     Each site has a constant force besides, so that a sensor's offset does no harm.
+
+    Raises:
+        InputError: a declared term is not finite along them.
     """
     from scipy.interpolate import make_interp_spline
 
@@ -362,6 +384,9 @@ def regressed(problem: Problem) -> tuple[float, ...]:
         driven = stretches.driven(record.times, splines)
         zero = np.zeros(len(dynamics.terms))
         values = dynamics.linear(zero, record.times, nodes, f, driven, derivatives=False)[1]
+        for term, sound in zip(dynamics.terms, np.isfinite(values).all(axis=(0, 2, 3)), strict=True):
+            if not sound:
+                raise InputError(f"the declared term {term.text} is infinite along the readings; check their unit")
         curve = make_interp_spline(record.times, np.moveaxis(values, 2, 0), k=min(3, len(record.times) - 1))
         total = curve.antiderivative()(record.times)
         rate = nodes.reshape(len(nodes), dynamics.order, dynamics.parts, dynamics.count)[:, -1]

@@ -187,6 +187,8 @@ class Tangent:
             by = np.zeros((_columns_of(one), 1 + DIRECTIONS))
             for number in range(len(self.along)):
                 by += self._pulled(number, one)
+            # What overflows along the motion wins nothing.
+            by = np.where(np.isfinite(by), by, 0.0)
             size = np.linalg.norm(by[:, 1:], axis=1, keepdims=True)
             scaled = by / np.where(size > 0, size, 1.0)
             u, values, _ = np.linalg.svd(scaled[:, 1:], full_matrices=False)
@@ -311,7 +313,10 @@ class Tangent:
         if self._kept is None or self._kept.of != known:
             flat = self._whitened(batch)
             whole = np.linalg.norm(flat.reshape(-1, flat.shape[-1]), axis=0)
-            self._kept = _Responses(known, whole, self._moving_on(by_pieces(self.fitted.layout, flat)))
+            columns = self._moving_on(by_pieces(self.fitted.layout, flat))
+            # What overflows along the motion wins nothing.
+            sound = np.isfinite(whole) & np.isfinite(columns).all(axis=0)
+            self._kept = _Responses(known, np.where(sound, whole, 0.0), np.where(sound, columns, 0.0))
         return self._kept
 
     def _moving_on(self, pieces: Sequence[ndarray]) -> ndarray:

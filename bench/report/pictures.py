@@ -203,7 +203,7 @@ def prediction(shown: WorstForecast) -> str:
     seen = seen[np.isfinite(seen)]
     low, high = (float(np.min(seen)), float(np.max(seen))) if len(seen) else (-1.0, 1.0)
     # A forecast that runs away must not hide the readings.
-    room = 0.6 * (high - low) + 1e-12
+    room = 0.6 * (high - low) + 1e-9 * max(abs(low), abs(high)) or 1.0
     for one, _, _ in sides:
         t, values = thinned(one.t, one.seen[:, 0, site])
         dense = len(one.t) > 150
