@@ -7,12 +7,16 @@ from typing import Annotated, Any, TypeVar
 
 import pydantic
 
+from latticebench.bench.case import Seed
+
 MOST_SEEDS = 10_000
 
 T = TypeVar("T")
 
 
 def _listed(value: Any) -> Any:
+    if value == []:
+        raise ValueError("an empty list makes no cases; leave the key out")
     return value if isinstance(value, list) else [value]
 
 
@@ -27,4 +31,4 @@ def _seeds(value: Any) -> Any:
 
 
 Listed = Annotated[list[T], pydantic.BeforeValidator(_listed)]
-Seeds = Annotated[list[pydantic.NonNegativeInt], pydantic.BeforeValidator(_seeds)]
+Seeds = Annotated[list[Seed], pydantic.BeforeValidator(_seeds)]

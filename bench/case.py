@@ -11,17 +11,26 @@ from __future__ import annotations
 import json
 import math
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import pydantic
+
+if TYPE_CHECKING:
+    from typing import Self
 
 # What can become of a case: besides a result, the method or the trial cannot take such data ("skipped"), an exception,
 # a limit, or a worker process that ended by itself.
 STATUSES = ("ok", "skipped", "failed", "memory", "timeout", "died")
 
 Number = Annotated[float, pydantic.Field(allow_inf_nan=False)]
+# What NumPy draws from and SQLite keeps.
+Seed = Annotated[int, pydantic.Field(ge=0, lt=2**63)]
+# A name of a file, without its ending.
+NAME = r"^\w[\w .+=-]{0,99}$"
+Name = Annotated[str, pydantic.Field(pattern=NAME)]
 # Where measured recordings lie unless told otherwise.
 DATA = Path("data")
 # Settings that do not decide the result: two cases that differ in these alone are one.
@@ -30,9 +39,19 @@ _SORTED = json.JSONEncoder(sort_keys=True)
 
 
 class Settings(pydantic.BaseModel):
-    """A frozen model that refuses keys it does not know."""
+    """A frozen model that refuses keys it does not know, and values of another type: true is not 1, nor is "1"."""
 
-    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> Self:
+        """Return what TOML or JSON has, where a list stands for a tuple.
+
+        Raises:
+            pydantic.ValidationError: a key is unknown or missing, or its value is of another type or out of range.
+        """
+        # A date of TOML's becomes what no key may be.
+        return cls.model_validate_json(json.dumps(content, default=lambda value: {"date": str(value)}))
 
 
 @dataclass(frozen=True)
@@ -77,7 +96,7 @@ class Case(Settings):
     kind: str
     part: str = ""
     time_limit: Annotated[float, pydantic.Field(gt=0, allow_inf_nan=False)] = 120.0
-    memory_limit: pydantic.PositiveInt = 4096
+    memory_limit: Annotated[int, pydantic.Field(gt=0, lt=2**40)] = 4096
 
     @property
     def identity(self) -> str:

@@ -76,7 +76,7 @@ def panels(results: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, 
     """
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for result in results:
-        case = FitCase.model_validate(result["case"])
+        case = FitCase.of(result["case"])
         if result["coefficients"] is not None:
             groups.setdefault(slug(f"{case.part} {case.data} {case.library} seed {case.seed}"), []).append(result)
     return {name: group for name, group in groups.items() if any(result["history"] for result in group)}
@@ -99,7 +99,7 @@ def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
     from matplotlib.lines import Line2D
 
     learnt = [result for result in group if result["history"]]
-    case = FitCase.model_validate(group[0]["case"])
+    case = FitCase.of(group[0]["case"])
     terms, truth = list(group[0]["coefficients"]), group[0]["truth"]
     colours = _colours(terms, truth)
     widths = [4.0] * len(learnt) + [0.8 + 0.55 * len(group)]

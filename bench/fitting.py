@@ -20,7 +20,7 @@ import numpy as np
 import pydantic
 
 from latticebench import methods, systems
-from latticebench.bench.case import Case, Folders, Number, Roots, plain
+from latticebench.bench.case import Case, Folders, Number, Roots, Seed, plain
 from latticebench.bench.limit import Limit, bound_of
 from latticebench.bench.memory import peak_mib, reset_peak
 from latticebench.bench.score import Forecast, forecast, score
@@ -70,7 +70,7 @@ class FitCase(Case):
     noise: Annotated[float, pydantic.Field(ge=0, allow_inf_nan=False)] = 0.0
     missing: Annotated[float, pydantic.Field(ge=0, lt=1)] = 0.0
     mirror: bool = False
-    seed: pydantic.NonNegativeInt = 1
+    seed: Seed = 1
     library: str
     terms: tuple[str, ...] = ()
     label: str

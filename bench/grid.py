@@ -32,7 +32,7 @@ class Grid(Settings):
     system: str
     parameters: dict[str, Listed[Number]] = {}
     libraries: list[str] = []
-    terms: dict[str, list[str]] = {}
+    terms: dict[str, Listed[str]] = {}
     initial: Listed[str | None] = [None]
     sites: Listed[int | None] = [None]
     ends: Listed[str | None] = [None]
@@ -73,12 +73,8 @@ class Grid(Settings):
         for label in labels:
             if label not in contestants:
                 raise unknown("method", label, contestants, where)
-        for name, value in self:
-            if value == [] and name != "libraries":
-                raise InputError(f"{where}: {name}: an empty list makes no cases; leave the key out")
-        for name, values in self.parameters.items():
-            if not values:
-                raise InputError(f"{where}: parameters.{name}: an empty list makes no cases; leave the key out")
+        if not labels:
+            raise InputError(f"{where}: methods: an empty list makes no cases; leave the key out")
         if not self.libraries and not self.terms:
             raise InputError(f"{where}: libraries: give at least one")
         libraries = [(name, ()) for name in self.libraries] + [

@@ -43,8 +43,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
+import numpy as np
 import pydantic
 
 from latticebench import methods, systems
@@ -52,17 +53,22 @@ from latticebench.bench.case import DATA, Case, Folders, Settings, code_file
 from latticebench.bench.effort import check_cases, check_size
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.grid import Contestant, Grid
-from latticebench.methods.method import make
+from latticebench.methods.method import check_fit, make
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import check_regular
+from latticebench.systems.lattice import System, library
+from latticebench.systems.samples import Samples
 from latticebench.systems.toml import read_toml
 
 HERE = Path(__file__).parent / "suites"
 
 
+Label = Annotated[str, pydantic.StringConstraints(pattern=r"\S", max_length=200)]
+
+
 class _File(Settings):
     title: str = ""
-    methods: dict[str, Contestant] = {}
+    methods: dict[Label, Contestant] = {}
     defaults: dict[str, Any] = {}
     grid: list[dict[str, Any]] = []
     made: list[dict[str, Any]] = []
@@ -132,7 +138,10 @@ def load(name: str, data: Path = DATA, *, large: bool = False) -> Suite:
     if not (file.grid or file.made or file.laboratory or file.measured):
         raise InputError(f"{shown}: no cases; write at least one [[grid]], [[made]], [[laboratory]] or [[measured]]")
     cases: dict[str, Case] = {}
-    blocks = (_fits(file, shown, large), _trials(file, shown), _laboratory(file, shown), _recordings(file, shown))
+    blocks = (
+        _fits(file, shown, large), _trials(file, shown, folders.suite), _laboratory(file, shown),
+        _recordings(file, shown),
+    )  # fmt: skip
     for case in itertools.chain(*blocks):
         cases[case.identity] = case
         if not large:
@@ -144,6 +153,10 @@ def load(name: str, data: Path = DATA, *, large: bool = False) -> Suite:
             raise InputError(f"{shown}: methods.{label}: {error}") from None
     try:
         _look_up((case for case in cases.values() if isinstance(case, FitCase)), folders.suite, large)
+        if not large:
+            for case in cases.values():
+                if not isinstance(case, FitCase):
+                    check_size(case, getattr(case, "sites", 1), case.title)
     except InputError as error:
         raise InputError(f"{shown}: {error}") from None
     return Suite(path.stem, file.title, cases, folders, file.methods)
@@ -159,7 +172,7 @@ def _fits(file: _File, shown: str, large: bool) -> Iterator[Case]:
             yield from grid.cases(file.methods, where)
 
 
-def _trials(file: _File, shown: str) -> Iterator[Case]:
+def _trials(file: _File, shown: str, base: Path) -> Iterator[Case]:
     if file.made:
         from latticebench.bench.trials.trial import Made, Trial
 
@@ -167,7 +180,7 @@ def _trials(file: _File, shown: str) -> Iterator[Case]:
             where = f"{shown}: made {number}"
             made = _checked(Made, block, where)
             with _told(where, Trial):
-                yield from made.cases(where)
+                yield from made.cases(where, base)
 
 
 def _laboratory(file: _File, shown: str) -> Iterator[Case]:
@@ -185,8 +198,18 @@ def _recordings(file: _File, shown: str) -> Iterator[Case]:
     if file.measured:
         from latticebench.bench.trials.measured import Measured
 
+        known: set[str] = set()
         for number, block in enumerate(file.measured, start=1):
-            yield _checked(Measured, block, f"{shown}: measured {number}")
+            where = f"{shown}: measured {number}"
+            one = _checked(Measured, block, where)
+            if one.name.casefold() in known:
+                raise InputError(f"{where}: name: there are two recordings called {one.name!r}; their reports need two")
+            known.add(one.name.casefold())
+            try:
+                library("declared", one.terms)
+            except InputError as error:
+                raise InputError(f"{where}: terms: {error}") from None
+            yield one
 
 
 def _check_method(contestant: Contestant, base: Path) -> None:
@@ -202,14 +225,14 @@ def _check_method(contestant: Contestant, base: Path) -> None:
 
 
 def _look_up(cases: Iterable[FitCase], base: Path, large: bool) -> None:
-    """Make sure that the systems, parameters, initial states and libraries of cases exist, and that the samples fit.
+    """Make sure that the systems, parameters, initial states and libraries of cases exist, and go with one another.
 
     Raises:
         InputError: one of them does not.
     """
     known = set()
     for case in cases:
-        size = (case.sites, case.samples, case.trajectories, case.span, case.memory_limit)
+        size = (case.sites, case.ends, case.known_ends, case.samples, case.trajectories, case.span, case.memory_limit)
         about = (case.system, case.library, case.terms, case.initial, tuple(case.parameters.items()), size)
         if about in known:
             continue
@@ -221,10 +244,18 @@ def _look_up(cases: Iterable[FitCase], base: Path, large: bool) -> None:
             check_size(case, case.sites or (systems.find(case.system, base).sites if path is None else 1), case.data)
         if path is not None:
             continue
-        system, _ = case.resolve(base)
+        system, candidates = case.resolve(base)
         system.with_parameters(case.parameters)
+        check_fit([_blank(case, system)], candidates, system.order)
         if case.initial is not None and case.initial not in system.initials:
             raise unknown("initial state", case.initial, system.initials, f"system {system.name!r}")
+
+
+def _blank(case: FitCase, system: System) -> Samples:
+    """Return two samples of a chain at rest, of the size and kind that a case's samples have."""
+    u = np.zeros((2, case.sites or system.sites), dtype=complex if system.is_complex else float)
+    ends = (case.ends or system.ends) if case.known_ends else "unknown"
+    return Samples(np.arange(2.0), u, source=case.data, ends=ends)
 
 
 Model = TypeVar("Model", bound=Settings)
@@ -232,7 +263,7 @@ Model = TypeVar("Model", bound=Settings)
 
 def _checked(model: type[Model], content: Mapping[str, Any], where: str) -> Model:
     with _told(where, model):
-        return model.model_validate(content)
+        return model.of(content)
 
 
 @contextmanager
@@ -252,4 +283,5 @@ def _unsound(where: str, error: pydantic.ValidationError, model: type[Settings])
         known = Contestant.model_fields if nested else model.model_fields
         return unknown("key", str(first["loc"][-1]), known, f"{where}: {path}" if nested else where)
     given = "" if first["type"] == "missing" else f", it is {first['input']!r}"
-    return InputError(f"{where}: {path}: {first['msg'][0].lower()}{first['msg'][1:]}{given}")
+    told = first["msg"].removeprefix("Value error, ")
+    return InputError(f"{where}: {path}: {told[0].lower()}{told[1:]}{given}")

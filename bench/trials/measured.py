@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from latticebench.bench.case import Case, Folders, Roots
+from latticebench.bench.case import Case, Folders, Name, Roots
 from latticebench.bench.report.content import content
 from latticebench.bench.report.document import to_dict
 from latticebench.diagnosis.repair import diagnose
@@ -20,6 +20,15 @@ from latticebench.systems.lattice import library
 from latticebench.systems.readers import read
 from latticebench.systems.samples import Samples
 from latticebench.systems.stencil import Ends
+
+
+def _ordered(rows: tuple[int, int]) -> tuple[int, int]:
+    if rows[0] >= rows[1]:
+        raise ValueError("the first row must come before the last")
+    return rows
+
+
+_ORDERED = pydantic.AfterValidator(_ordered)
 
 
 class Measured(Case):
@@ -34,15 +43,15 @@ class Measured(Case):
     """
 
     kind: Literal["measured"] = "measured"
-    name: str
+    name: Name
     about: str = ""
-    file: str
-    rows: tuple[pydantic.NonNegativeInt, pydantic.PositiveInt] | None = None
+    file: Annotated[str, pydantic.StringConstraints(pattern=r"^[^\x00]*\S[^\x00]*$")]
+    rows: Annotated[tuple[pydantic.NonNegativeInt, pydantic.PositiveInt], _ORDERED] | None = None
     terms: str
     order: Literal[1, 2]
     ends: Ends = "unknown"
     time_limit: Annotated[float, pydantic.Field(gt=0, allow_inf_nan=False)] = 7200.0
-    memory_limit: pydantic.PositiveInt = 16_384
+    memory_limit: Annotated[int, pydantic.Field(gt=0, lt=2**40)] = 16_384
 
     @property
     def title(self) -> str:

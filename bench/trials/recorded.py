@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from latticebench.bench.case import NAME
 from latticebench.bench.provenance import lines
 from latticebench.bench.publish import format_number, markdown_list, readable
+from latticebench.systems.errors import InputError
 from latticebench.systems.files import write_text
 
 TABLES = ("measured",)
@@ -49,11 +52,15 @@ def publish(
     """Write the page, and the report on each recording.
 
     Raises:
-        InputError: a file cannot be written.
+        InputError: a file cannot be written, or a recording's name is none of a file.
     """
     if not only:
         return []
     ordered = sorted(results, key=lambda result: str(result["case"]["name"]))
+    for result in ordered:
+        # The store may be anybody's; its names must not lead out of the folder.
+        if not re.fullmatch(NAME, str(result["case"]["name"])):
+            raise InputError(f"{folder}: a recording called {result['case']['name']!r} can have no file of that name")
     head = markdown_list(lines(about))
     text = ["# Measured recordings", "", *head, "", *(line for result in ordered for line in _recording(result))]
     path = folder / "measured.md"

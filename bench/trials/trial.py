@@ -7,6 +7,7 @@ import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -14,13 +15,14 @@ import pydantic
 
 from latticebench import systems
 from latticebench.bench.axes import Listed, Seeds
-from latticebench.bench.case import Case, Folders, Number, Roots, Settings, plain
+from latticebench.bench.case import Case, Folders, Roots, Seed, Settings, code_file, plain
 from latticebench.bench.trials import faults, specimen
 from latticebench.bench.trials.specimen import Conditions, Specimen
 from latticebench.diagnosis.repair import Diagnosis, diagnose
 from latticebench.methods.method import Skipped
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.files import check_regular
 from latticebench.systems.lattice import System
 
 # A recording whose effect could not be given its size (it is as good as invisible) is no trial.
@@ -51,9 +53,9 @@ class Trial(Case):
     kind: Literal["trial"] = "trial"
     system: str
     effect: str
-    z: Number = 0.0
+    z: Annotated[float, pydantic.Field(ge=0, allow_inf_nan=False)] = 0.0
     noise: Annotated[float, pydantic.Field(ge=0, allow_inf_nan=False)] = 0.01
-    seed: pydantic.NonNegativeInt = 1
+    seed: Seed = 1
     sites: pydantic.PositiveInt = 25
     samples: Annotated[int, pydantic.Field(ge=2)] = 50
     velocities: bool = True
@@ -137,17 +139,18 @@ class Made(Settings):
     time_limit: float = TIME_LIMIT
     memory_limit: int = 4096
 
-    def cases(self, where: str) -> Iterator[Trial]:
+    def cases(self, where: str, base: Path = Path()) -> Iterator[Trial]:
         """Return every combination.
 
         Args:
             where: the place of the block, for errors.
+            base: the folder that relative paths start from.
 
         Raises:
             InputError: a system or an effect is unknown.
         """
         for system in self.systems:
-            effects = _effects(self.effects, system, where)
+            effects = _effects(self.effects, _known(system, base, where), where)
             for noise, z, effect, seed in itertools.product(self.noise, self.z, effects, self.seeds):
                 yield Trial(
                     system=system, effect=effect, z=z, noise=noise, seed=seed, sites=self.sites, samples=self.samples,
@@ -156,13 +159,28 @@ class Made(Settings):
                 )  # fmt: skip
 
 
-def _effects(names: list[str], system: str, where: str) -> list[str]:
+def _known(name: str, base: Path, where: str) -> System | None:
+    """Return a system, or None for a Python file of the user's, whose code runs in the workers alone."""
+    try:
+        path = code_file(name)
+        if path is None:
+            found = systems.find(name, base)
+            found.library("equation")
+            return found
+        check_regular(base / path)
+    except InputError as error:
+        raise InputError(f"{where}: systems: {error}") from None
+    return None
+
+
+def _effects(names: list[str], found: System | None, where: str) -> list[str]:
     """Return names of effects with each group written out as those that make sense in a system."""
     known = [faults.NONE, *KNOWN, *faults.OTHERS]
-    found = systems.find(system)
     effects: list[str] = []
     for name in names:
         if name in GROUPS:
+            if found is None:
+                raise InputError(f"{where}: effects: {name!r}: write out those that make sense in a system of your own")
             effects += [one for one in GROUPS[name] if faults.sensible(one, found)]
             continue
         for part in name.split("+"):

@@ -11,7 +11,7 @@ import numpy as np
 import pydantic
 
 from latticebench.bench.axes import Listed, Seeds
-from latticebench.bench.case import Case, Folders, Roots, Settings, plain
+from latticebench.bench.case import Case, Folders, Roots, Seed, Settings, plain
 from latticebench.bench.trials.laboratory.effects import ANY, MOST_EFFECTS, NAMES, NONE
 from latticebench.bench.trials.laboratory.instruments import HELD_OUT, KINDS, Kind
 from latticebench.bench.trials.laboratory.judging import Finding, findings, residual, written
@@ -38,7 +38,7 @@ class Laboratory(Case):
     instrument: str = ANY
     effects: str = ANY
     sites: pydantic.NonNegativeInt = 0
-    seed: pydantic.NonNegativeInt = 1
+    seed: Seed = 1
     time_limit: Annotated[float, pydantic.Field(gt=0, allow_inf_nan=False)] = TIME_LIMIT
 
     @property

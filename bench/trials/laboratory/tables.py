@@ -48,7 +48,7 @@ def _known(result: Mapping[str, Any]) -> Mapping[str, Any]:
         return result
     from latticebench.bench.trials.laboratory.case import Laboratory, about
 
-    one = Laboratory.model_validate(result["case"]).recording()
+    one = Laboratory.of(result["case"]).recording()
     return {**result, "recording": about(one), "truth": written(one)}
 
 
