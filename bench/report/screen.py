@@ -72,7 +72,7 @@ def show_fit(fit: Fit) -> None:
         else f"; {100 * fit.residual:.3g} % of the derivative is left, its noise included"
     )
     for line in (written(fit), f"{fit.method}: {fit.status}{left}; {fit.seconds:.2f} s"):
-        console().print(line, highlight=False, markup=False, soft_wrap=True)
+        console().print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
 
 def show_limit(limit: Limit, design: Design, note: str) -> None:

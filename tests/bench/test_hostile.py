@@ -174,6 +174,43 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
+MARKER = f"fitted-{os.getpid()}"
+
+
+def fitted(folder: Path, deed: str, *options: str) -> subprocess.CompletedProcess[str]:
+    """Fit by a method that does a deed, within limits."""
+    before, within, *_ = DEEDS[deed]
+    body = METHOD.format(marker=MARKER, before=before, within=textwrap.indent(within, " " * 8))
+    (folder / "m.py").write_text(body)
+    (folder / "t.csv").write_text("t,u1,u2,u3\n" + "".join(f"{k},{k % 3},{k % 4},{k % 5}\n" for k in range(12)))
+    command = [
+        sys.executable, "-m", "latticebench", "fit", "t.csv", "--terms", "u[n]", "--order", "2", "--ends", "free",
+        "--method", "m.py", "--json", "r.json", *options,
+    ]  # fmt: skip
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+def test_a_method_that_prints_is_fitted_and_its_output_shown_apart(tmp_path: Path) -> None:
+    done = fitted(tmp_path, "prints when imported")
+    assert done.returncode == 0, done.stderr
+    assert "from below" in done.stderr
+    assert "from below" not in done.stdout
+    assert (tmp_path / "r.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("deed", ["ends when imported", "hangs when imported", "children eat", "complex", "crashes"])
+def test_a_hostile_method_that_is_fitted_is_one_line_with_the_reason(deed: str, tmp_path: Path) -> None:
+    seconds = "2" if DEEDS[deed][2] == "timeout" else "3600"
+    done = fitted(tmp_path, deed, "--time-limit", seconds, "--memory-limit", "900")
+    assert done.returncode == 2
+    line = done.stderr.splitlines()[-1]
+    assert line.startswith(f"error: method 'm.py': {DEEDS[deed][2]}: ")
+    assert DEEDS[deed][3] in line
+    assert not (tmp_path / "r.json").exists()
+    assert alive(MARKER) == []
+
+
 def test_a_suite_names_a_method_file_that_is_not_there(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text(
         '[methods.a]\nmethod = "gone.py"\n[[grid]]\nsystem = "phi4"\nlibraries = ["lib1"]\n'
