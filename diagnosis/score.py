@@ -455,7 +455,8 @@ def _columns_of(one: Placed) -> int:
 
 
 def _orthonormal(columns: Float[ndarray, "readings numbers"]) -> Float[ndarray, "readings held"]:
-    """Return an orthonormal basis of columns."""
+    """Return an orthonormal basis of columns, but for those that overflow."""
     norm = np.linalg.norm(columns, axis=0)
-    left, values, _ = np.linalg.svd(columns / np.where(norm > 0, norm, 1.0), full_matrices=False)
+    columns = np.where(np.isfinite(norm), columns, 0.0)
+    left, values, _ = np.linalg.svd(columns / np.where((norm > 0) & np.isfinite(norm), norm, 1.0), full_matrices=False)
     return np.asarray(left[:, values > 1e-7 * max(float(np.max(values, initial=0.0)), 1e-300)])
