@@ -239,7 +239,7 @@ class Store:
         try:
             yield from self.connection.execute(query, values)
         except FAILURES as error:
-            raise _damaged(self.path, str(error)) from None
+            raise _unreadable(self.path, error) from None
 
 
 @dataclass(frozen=True)
@@ -338,11 +338,11 @@ def open_store(folder: Path) -> Store:
     except FAILURES as error:
         # A place that cannot be written has no room for the index of a journal; nor does anybody write there.
         if not isinstance(error, sqlite3.OperationalError) or (folder / OWN_FILES[1]).exists():
-            raise _damaged(path, str(error)) from None
+            raise _unreadable(path, error) from None
     try:
         return Store(path, _connect(path, "ro&immutable=1"))
     except FAILURES as error:
-        raise _damaged(path, str(error)) from None
+        raise _unreadable(path, error) from None
 
 
 def is_store(folder: Path) -> bool:
@@ -412,6 +412,13 @@ def _unwritable(path: Path, error: Exception) -> InputError:
     return InputError(
         f"{path}: cannot be written: {error}; nothing that was there is lost; is the place full or read-only?"
     )
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    """Tell a place that is full or locked from a store that is damaged: of the former nothing must be deleted."""
+    if isinstance(error, sqlite3.OperationalError) and not str(error).startswith("no such"):
+        return InputError(f"{path}: cannot be read now: {error}; is the place full, or another run writing to it?")
+    return _damaged(path, str(error))
 
 
 def _damaged(path: Path, what: str) -> InputError:

@@ -1,0 +1,120 @@
+"""A disk that is full at any point of any output: one clear line, nothing half-written, and the screen has the rest."""
+
+from __future__ import annotations
+
+import gc
+import io
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from latticebench.bench.cli import main
+
+# joblib remarks that it has no room for what it shares.
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+resource = pytest.importorskip("resource", reason="limits files as POSIX systems do")
+
+FIT = ("--terms", "u[n]; u[n]**3", "--order", "2", "--ends", "free")
+SUITE = """
+[methods.a]
+method = "least-squares"
+[[grid]]
+system = "phi4"
+sites = 5
+samples = 8
+span = 1.0
+libraries = ["lib1"]
+noise = [0.0, 0.01]
+"""
+# The command, the file or folder that it writes, and what the screen has all the same.
+COMMANDS = {
+    "fit": (["fit", "t.csv", *FIT, "--method", "least-squares", "--json", "r.json"], "r.json", "u'' ="),
+    "limit": (["limit", "--system", "phi4", "--library", "lib1", "--json", "r.json"], "r.json", "bound"),
+    "diagnose": (["diagnose", "t.csv", *FIT, "--json", "r/r.json", "--html", "r/r.html"], "r", "What the equation"),
+    "simulate csv": (["simulate", "phi4", "--sites", "5", "--out", "r.csv"], "r.csv", ""),
+    "simulate npz": (["simulate", "phi4", "--sites", "5", "--out", "r.npz"], "r.npz", ""),
+    "simulate parquet": (["simulate", "phi4", "--sites", "5", "--out", "r.parquet"], "r.parquet", ""),
+    "table": (["table", "store", "--out", "r"], "r", "lib1"),
+    "figures": (["figures", "store", "--out", "r"], "r", ""),
+    "schema": (["schema", "--out", "r"], "r", ""),
+}  # fmt: skip
+
+
+def latticebench(folder: Path, *arguments: str) -> tuple[int, str, str]:
+    """Run a command within this process; return its exit code, what it prints, and what it complains of."""
+    out, err, before = io.StringIO(), io.StringIO(), Path.cwd()
+    os.chdir(folder)
+    try:
+        with (
+            mock.patch.object(sys, "argv", ["latticebench", *arguments]), redirect_stdout(out), redirect_stderr(err),
+            mock.patch.dict(os.environ), pytest.raises(SystemExit) as end,
+        ):  # fmt: skip
+            main()
+    finally:
+        os.chdir(before)
+    return int(end.value.code or 0), out.getvalue(), err.getvalue()
+
+
+@contextmanager
+def room_for(size: int) -> Iterator[None]:
+    """Let no file become longer; what is written beyond fails as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Return what is in a folder, but for the store, which SQLite looks after."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.parent.name != "store")
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with samples and a store."""
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "s.toml").write_text(SUITE)
+    assert latticebench(folder, "simulate", "phi4", "--sites", "5", "--samples", "12", "--out", "t.csv")[0] == 0
+    assert latticebench(folder, "run", "s.toml", "--jobs", "1", "--results", "store")[0] == 0
+    # Closes the store, as the end of a process does.
+    gc.collect()
+    return folder
+
+
+def survive(made: Path, name: str, sizes: tuple[int, ...]) -> None:
+    arguments, place, shown = COMMANDS[name]
+    known = content(made)
+    for size in sizes:
+        with room_for(size):
+            code, out, err = latticebench(made, *arguments)
+        told = (name, size, code, err)
+        assert code in (0, 2), told
+        assert code == 0 or (err.startswith("error: ") and err.count("\n") == 1), told
+        assert shown in out or "store cannot be read now" in err.replace("/results.sqlite:", ""), told
+        now = content(made)
+        new = {path: text for path, text in now.items() if known.get(path) != text}
+        # What is there is whole: nothing ends where the room did, and nothing temporary is left.
+        assert all(len(text) > 0 and (len(text) < size or code == 0) for text in new.values()), told
+        assert all(path == place or path.startswith(f"{place}/") for path in new), (told, sorted(new))
+        assert not any("/." in f"/{path}" for path in now), told
+        for path in new:
+            (made / path).unlink()
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "diagnose"])
+def test_an_output_on_a_full_disk_is_whole_or_not_there(name: str, made: Path) -> None:
+    survive(made, name, (0, 700))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_output_on_a_disk_that_is_full_at_many_points_is_whole_or_not_there(name: str, made: Path) -> None:
+    survive(made, name, (0, 1, 100, 1000, 3000, 10_000, 30_000))
