@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +17,7 @@ from latticebench.methods.method import Fit, Skipped, make, solve
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.readers import read_all
+from latticebench.systems.samples import Samples
 from latticebench.systems.stencil import Ends
 
 # What of a fit comes back, besides its coefficients.
@@ -63,15 +66,22 @@ class Apart(Case):
         found.update({name: plain(getattr(fit, name)) for name in NUMBERS})
 
 
-def fit_apart(case: Apart, candidates: Library) -> tuple[Fit, str]:
-    """Fit in a process of its own, within the limits of the case.
+def fit_here(case: Apart, data: Sequence[Samples], candidates: Library) -> Fit:
+    """Fit in this process, without limits; what the method prints goes to standard error."""
+    with redirect_stdout(sys.stderr):
+        method = make(methods.find(case.method), case.settings, texts=True)
+        return solve(method, data, candidates, case.order, case.seed)
+
+
+def fit_apart(case: Apart, candidates: Library) -> Fit:
+    """Fit in a process of its own, within the limits of the case; the end of what it prints goes to standard error.
 
     Args:
         case: the fit.
         candidates: the library of its terms.
 
     Returns:
-        the fit, without its history, and the end of what the method has printed.
+        the fit, without its history.
 
     Raises:
         Skipped: the method cannot take the samples.
@@ -86,11 +96,12 @@ def fit_apart(case: Apart, candidates: Library) -> tuple[Fit, str]:
         raise InputError(f"method {case.method!r}: {found['status']}: {found['reason']}")
     stderr = None if found["stderr"] is None else _read(found["stderr"])
     numbers = dict(zip(NUMBERS, _read([found[name] for name in NUMBERS]).tolist(), strict=True))
-    fit = Fit(
+    if found["reason"]:
+        print(f"method {case.method!r}: {found['reason']}", file=sys.stderr)
+    return Fit(
         str(found["name"]), candidates, case.order, _read(found["coefficients"]), stderr=stderr, status=found["note"],
         **numbers,
     )  # fmt: skip
-    return fit, found["reason"]
 
 
 def _read(values: Sequence[float | str | None]) -> np.ndarray:

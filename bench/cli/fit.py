@@ -14,13 +14,14 @@ from latticebench.bench.cli.options import (
     AnyEnds,
     JsonOut,
     Library,
+    MemoryLimit,
+    MethodOption,
     Order,
     Settings,
     SystemOption,
     Terms,
+    TimeLimit,
     check_places,
-    complete_methods,
-    named,
 )
 
 EPILOG = (
@@ -38,27 +39,14 @@ def fit(
     library: Library = None,
     terms: Terms = None,
     order: Order = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            help="A name from `list methods`, or a .py file with one of your own.",
-            autocompletion=complete_methods,
-            parser=named,
-            metavar="NAME",
-        ),
-    ] = None,
+    method: MethodOption = None,
     given: Settings = None,
     ends: Annotated[
         AnyEnds, typer.Option(help="How the chain ends; unknown uses only sites whose whole stencil was seen.")
     ] = "unknown",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the method's own draws.")] = 1,
-    time_limit: Annotated[
-        float | None,
-        typer.Option(min=1e-3, max=1e9, metavar="S", help="Seconds that a .py method may take; 3600 if not given."),
-    ] = None,
-    memory_limit: Annotated[
-        int | None, typer.Option(min=1, max=10**9, metavar="MIB", help="What it may need; 4096 if not given.")
-    ] = None,
+    time_limit: TimeLimit = None,
+    memory_limit: MemoryLimit = None,
     json_out: JsonOut = None,
 ) -> None:
     """Fit the coefficients of a library to recorded samples.
@@ -66,39 +54,33 @@ def fit(
     A method of your own (.py) runs in a process of its own, within the limits; so does any method where one is given.
     """
     from latticebench import methods
-    from latticebench.bench.apart import Apart, fit_apart
+    from latticebench.bench.apart import Apart, fit_apart, fit_here
     from latticebench.bench.case import code_file
     from latticebench.bench.report.screen import show_fit, waiting
-    from latticebench.methods.method import make, solve
+    from latticebench.methods.method import make
     from latticebench.systems.files import check_regular, write_text
     from latticebench.systems.readers import read_all
 
     method = methods.DEFAULT if method is None else method
     check_places([*files, system, method], json=json_out)
-    own = code_file(method) is not None
-    if own:
-        check_regular(Path(code_file(method) or ""))
+    own = code_file(method)
+    if own is None:
+        make(methods.find(method), pairs(given), texts=True)
     else:
-        chosen = make(methods.find(method), pairs(given), texts=True)
+        check_regular(Path(own))
     # What a file of the user's prints is for people, not for a program that reads the result.
     with redirect_stdout(sys.stderr):
         _, candidates, order = asked(system, library, terms, order)
     data = read_all(files, ends)
+    asked_for = Apart(
+        files=tuple(files), ends=ends, terms=candidates.texts, order=order, method=method, settings=pairs(given),
+        seed=seed, time_limit=time_limit or TIME_LIMIT, memory_limit=memory_limit or MEMORY_LIMIT,
+    )  # fmt: skip
     with told(data, method, f"method {method!r}"), waiting(f"{method}: fitting {len(candidates.terms)} terms"):
-        if own or time_limit is not None or memory_limit is not None:
-            found, printed = fit_apart(
-                Apart(
-                    files=tuple(files), ends=ends, terms=candidates.texts, order=order, method=method,
-                    settings=pairs(given), seed=seed, time_limit=time_limit or TIME_LIMIT,
-                    memory_limit=memory_limit or MEMORY_LIMIT,
-                ),
-                candidates,
-            )  # fmt: skip
+        if own is None and time_limit is None and memory_limit is None:
+            found = fit_here(asked_for, data, candidates)
         else:
-            with redirect_stdout(sys.stderr):
-                found, printed = solve(chosen, data, candidates, order, seed), ""
-    if printed:
-        print(f"method {method!r}: {printed}", file=sys.stderr)
+            found = fit_apart(asked_for, candidates)
     if json_out != "-":
         show_fit(found)
     if json_out is None:

@@ -96,6 +96,20 @@ Settings = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE
 SystemOption = Annotated[
     str | None, typer.Option(help="Take order and libraries from this system.", autocompletion=complete_systems)
 ]
+MethodOption = Annotated[
+    str | None,
+    typer.Option(
+        help="A name from `list methods`, or a .py file with one of your own.", autocompletion=complete_methods,
+        parser=named, metavar="NAME",
+    ),
+]  # fmt: skip
+TimeLimit = Annotated[
+    float | None,
+    typer.Option(min=1e-3, max=1e9, metavar="S", help="Seconds that a .py method may take; 3600 if not given."),
+]
+MemoryLimit = Annotated[
+    int | None, typer.Option(min=1, max=10**9, metavar="MIB", help="What it may need; 4096 if not given.")
+]
 Library = Annotated[str | None, typer.Option(help="A library of the system.", autocompletion=complete_libraries)]
 Terms = Annotated[str | None, typer.Option(help="Terms of your own, with ; between them.")]
 Order = Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")]

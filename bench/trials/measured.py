@@ -45,10 +45,10 @@ class Measured(Case):
     kind: Literal["measured"] = "measured"
     name: Name
     about: str = ""
-    file: Annotated[str, pydantic.StringConstraints(pattern=r"^[^\x00]*\S[^\x00]*$")]
+    file: Annotated[str, pydantic.StringConstraints(pattern=r"^[^\x00]*[^\x00\s][^\x00]*$")]
     rows: Annotated[tuple[pydantic.NonNegativeInt, pydantic.PositiveInt], _ORDERED] | None = None
     terms: str
-    order: Literal[1, 2]
+    order: Annotated[int, pydantic.Field(ge=1, le=2)]
     ends: Ends = "unknown"
     time_limit: Annotated[float, pydantic.Field(gt=0, allow_inf_nan=False)] = 7200.0
     memory_limit: Annotated[int, pydantic.Field(gt=0, lt=2**40)] = 16_384
