@@ -251,8 +251,11 @@ class Fitted:
         whitener = self.noise.whitener(self.followed.swing, self.rows, seen)
         error = whitener.apply(np.where(seen, self.followed.left, 0.0))
         for column, read in zip((error * whitener.robust(error)).T, seen.T, strict=True):
+            # A sensor that was never read has no spectrum.
+            if not np.any(read):
+                continue
             power = np.abs(np.fft.rfft(column[read])) ** 2
-            if len(power) and np.max(power) > LINE * np.mean(power):
+            if np.max(power) > LINE * np.mean(power):
                 return True
         return False
 
