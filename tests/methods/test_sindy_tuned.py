@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from latticebench.methods.engine.integrated_equation import integrate_equation
 from latticebench.methods.engine.regression import Regression, triangular
 from latticebench.methods.engine.sparse import sparse_fit
 from latticebench.methods.method import make, solve
-from latticebench.methods.sindy_tuned import OPTIMIZERS, SINDyTuned, options, path
+from latticebench.methods.sindy_tuned import Optimizer, SINDyTuned, options, path
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -37,7 +39,7 @@ def test_the_choice_is_hardly_worse_than_the_median_of_what_was_searched(name: s
     truth = clean.truth(candidates)
     assert truth is not None
     samples = observe(clean, np.random.default_rng(3), noise=noise).observed()
-    method = SINDyTuned(optimizers=OPTIMIZERS, models=5)
+    method = SINDyTuned(optimizers=get_args(Optimizer), models=5)
     errors = [np.linalg.norm(one.coefficients - truth) for one in method.search([samples], candidates, system.order, 1)]
     fit = solve(method, [samples], candidates, system.order, 1)
     error = np.linalg.norm(fit.coefficients - truth)
@@ -154,7 +156,7 @@ def test_each_criterion_finds_the_oscillator_and_says_what_was_chosen(criterion:
     method = make(methods.find("sindy-tuned"), {"criterion": criterion})
     fit = solve(method, [oscillators(), oscillators(40)], library("lib", "u[n]; u[n]**3"), 2, 1)
     np.testing.assert_allclose(fit.coefficients, [-2, 0], atol=1e-3)
-    assert fit.found["optimizer"] in OPTIMIZERS
+    assert fit.found["optimizer"] in get_args(Optimizer)
     assert str(fit.found["differentiation"]).split()[0] in SINDyTuned().differentiations
     assert float(fit.found["candidates"]) > 10
 

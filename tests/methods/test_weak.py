@@ -11,7 +11,7 @@ import pytest
 from latticebench import systems
 from latticebench.methods.engine.errors_in_variables import estimate
 from latticebench.methods.engine.weak_form import WeakForm
-from latticebench.methods.method import Fit
+from latticebench.methods.method import Fit, make
 from latticebench.methods.weak import Weak
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
