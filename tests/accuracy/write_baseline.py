@@ -32,11 +32,12 @@ def origins(text: str) -> list[dict[str, Any]]:
 
 if __name__ == "__main__":
     store = open_store(Path(sys.argv[1]))
-    table, made = cases(store.results())[KEPT], store.origins()
+    table, made, about = cases(store.results())[KEPT], store.origins(), store.about()
     if sys.argv[2:] == ["keep"]:
         old = pd.read_csv(BASELINE, comment="#")[KEPT]
         stays = old["identity"].isin(load("accuracy").by_identity) & ~old["identity"].isin(table["identity"])
         table = pd.concat([table, old[stays]])
         made = [*origins(BASELINE.read_text(encoding="utf-8")), *made]
+        about |= {"command": "python tests/accuracy/write_baseline.py STORE keep", "suite": "a part of accuracy"}
     table = table.sort_values(["data", "library", "method"])
-    write_text(BASELINE, render(table, describe(made, store.about(), store.seeds()), "csv"))
+    write_text(BASELINE, render(table, describe(made, about, store.seeds()), "csv"))
