@@ -16,6 +16,7 @@ from latticebench.bench.pool import execute
 from latticebench.methods.method import Fit, Skipped, make, solve
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
+from latticebench.systems.layout import Layout
 from latticebench.systems.readers import read_all
 from latticebench.systems.samples import Samples
 from latticebench.systems.stencil import Ends
@@ -28,7 +29,7 @@ class Apart(Case):
     """The fit of a library to the samples of files.
 
     Attributes:
-        files, ends: the samples.
+        files, ends, layout: the samples.
         terms, order: the equation.
         method, settings: who fits it, the settings as texts of a command line.
         seed: of the method's draws.
@@ -42,6 +43,7 @@ class Apart(Case):
     method: str
     settings: dict[str, str]
     seed: int
+    layout: Layout = Layout()
 
     @property
     def title(self) -> str:
@@ -60,7 +62,7 @@ class Apart(Case):
     def run(self, folders: Folders, found: dict[str, Any]) -> None:
         """Read the samples and fit them; see `Case.run`."""
         method = make(methods.find(self.method, folders.suite), self.settings, texts=True)
-        fit = solve(method, read_all(self.files, self.ends), library("terms", self.terms), self.order, self.seed)
+        fit = solve(method, read_all(self.files, self.ends, self.layout), library("terms", self.terms), self.order, self.seed)
         found.update(name=fit.method, note=fit.status, coefficients=fit.coefficients.tolist())
         found["stderr"] = None if fit.stderr is None else [plain(one) for one in fit.stderr]
         found.update({name: plain(getattr(fit, name)) for name in NUMBERS})

@@ -1,103 +1,114 @@
 """Reading samples from files.
 
-CSV and Parquet have the columns `t,u1..uN[,v1..vN][,f1..fN | f]` (real field) or `t,re1..reN,im1..imN[,f1..fN | f]`
-(complex field), and a column `trajectory` where one file holds several. NPZ has the arrays
-`t, u[, v, f, trajectory]` and is never unpickled. Missing values are empty cells or NaN.
+As this project writes them, CSV and Parquet have the columns `t,u1..uN[,v1..vN][,f1..fN | f]` (real field) or
+`t,re1..reN,im1..imN[,f1..fN | f]` (complex field), and a column `trajectory` where one file holds several. NPZ has the
+arrays `t, u[, v, f, trajectory]` and is never unpickled. Missing values are empty cells or NaN. A `Layout` says where
+else times and readings are, and in which units; text files and spreadsheets may look as `latticebench.systems.tables`
+says.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 import zipfile
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from latticebench.systems.errors import InputError
-from latticebench.systems.files import DATA, LARGEST, check_regular, largest, read_text, reading, shown
-from latticebench.systems.samples import Samples, check_alike
+from latticebench.systems.files import DATA, check_regular, reading, shown
+from latticebench.systems.layout import UNITS, Layout, choose, quoted
+from latticebench.systems.samples import Origin, Samples, check_alike
 from latticebench.systems.stencil import Ends
+from latticebench.systems.tables import Table, check_count, named_once, read_csv, read_sheet
 
 if TYPE_CHECKING:
     import pandas
     import pyarrow
     from numpy import ndarray
 
+# What is written and read, and what is only read.
 FORMATS = (".csv", ".npz", ".parquet")
+OTHERS = (".txt", ".tsv", ".dat", ".xlsx")
+PLAIN = Layout()
 ARRAYS = ("t", "u", "v", "f", "trajectory")
-# Characters of a cell; the longest number has some 25.
-MOST_IN_A_CELL = 10_000
 
 
-def read(path: Path, ends: Ends = "unknown") -> list[Samples]:
+def read(path: Path, ends: Ends = "unknown", layout: Layout = PLAIN) -> list[Samples]:
     """Return the trajectories of one file.
 
     Args:
-        path: a CSV, NPZ or Parquet file.
+        path: a file of `FORMATS` or `OTHERS`.
         ends: how the chain ends.
+        layout: how the recording lies in the file, if not as this project writes it.
 
     Raises:
         InputError: the file is missing, of another form, or holds invalid data; the message names file, row and column.
     """
-    check_ending(path)
+    check_ending(path, (*FORMATS, *OTHERS))
     check_regular(path)
     if path.stat().st_size == 0:
         raise InputError(f"{shown(path)}: the file is empty (0 bytes)")
+    source = shown(path)
     match path.suffix.lower():
         case ".npz":
-            return _from_arrays(_read_npz(path), shown(path), ends)
-        case ".csv":
-            return _from_table(_read_csv(path), shown(path), ends)
+            return _from_arrays(_read_npz(path, layout), source, ends, layout)
+        case ".parquet":
+            return _from_table(_read_parquet(path, layout), source, ends, layout)
+        case ".xlsx":
+            return _from_table(read_sheet(path, layout), source, ends, layout)
         case _:
-            return _from_table(_read_parquet(path), shown(path), ends)
+            return _from_table(read_csv(path, layout), source, ends, layout)
 
 
-def _check_count(values: int, path: Path) -> None:
-    """Refuse more numbers than a file of the largest size could hold as they are.
-
-    Raises:
-        InputError: there are more, be it that a small file unpacks to them.
-    """
-    if 8 * values > largest(DATA):
-        raise InputError(
-            f"{shown(path)}: it holds {8 * values / 2**20:.0f} MiB of numbers, at most {largest(DATA) // 2**20} are "
-            f"read; if it is meant to be so long, raise that with --largest-file or {LARGEST}"
-        )
-
-
-def read_all(paths: Sequence[Path], ends: Ends = "unknown") -> list[Samples]:
-    """Return the trajectories of several files, which must have the same sites and columns.
+def read_all(paths: Sequence[Path], ends: Ends = "unknown", layout: Layout = PLAIN) -> list[Samples]:
+    """Return the trajectories of several files, which must have the same sites, columns and units.
 
     Raises:
         InputError: a file is invalid, or two of them differ.
     """
-    data = [samples for path in paths for samples in read(path, ends)]
+    data = [samples for path in paths for samples in read(path, ends, layout)]
     check_alike(data)
+    for one in data[1:]:
+        for name in ("time", "unit"):
+            units = [getattr(samples.origin, name) or "no unit" for samples in (one, data[0])]
+            if units[0] != units[1]:
+                raise InputError(
+                    f"{one.source}: {'times' if name == 'time' else 'readings'} in {units[0]}, those of "
+                    f"{data[0].source} in {units[1]}; read them apart, or bring them to one unit"
+                )
     return data
 
 
-def check_ending(path: Path) -> None:
-    """Check that the ending of a path is one of `FORMATS`, in small letters or capitals.
+def check_ending(path: Path, endings: Sequence[str] = FORMATS) -> None:
+    """Check the ending of a path, in small letters or capitals.
 
     Raises:
-        InputError: it is not.
+        InputError: it is not one of `endings`, which are those of files that are written if none are given.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise InputError(f"{shown(path)}: the ending {shown(path.suffix)!r} is not one of {', '.join(FORMATS)}")
+    if path.suffix.lower() not in endings:
+        raise InputError(f"{shown(path)}: the ending {shown(path.suffix)!r} is not one of {', '.join(endings)}")
 
 
-def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, source: str, ends: Ends) -> list[Samples]:
+@dataclass(frozen=True)
+class _Told:
+    """What is known of arrays besides their values: where they come from, and the name of the times."""
+
+    source: str
+    ends: Ends
+    origin: Origin
+    time: str = "t"
+    sort: bool = False
+
+
+def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, told: _Told) -> list[Samples]:
     """Return the samples of arrays t, u, v and f, one trajectory per label in order of first appearance."""
-    t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
-    assert t is not None
-    assert u is not None
     if labels is None:
-        return [Samples(t, u, v, f, None, source, ends)]
-    found = []
+        return [_samples(arrays, told)]
+    found, source = [], told.source
     names, first, group = np.unique(labels, return_index=True, return_inverse=True)
     if 2 * len(names) > len(labels):
         alone = names[np.argmin(np.bincount(group))]
@@ -105,16 +116,65 @@ def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, sou
     members = np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1])
     for number in np.argsort(first):
         label, rows = names[number], members[number]
-        own_v, own_f = (None if array is None else array[rows] for array in (v, f))
-        found.append(Samples(t[rows], u[rows], own_v, own_f, None, f"{source}, trajectory {label}", ends))
+        own = {name: None if array is None else array[rows] for name, array in arrays.items()}
+        found.append(_samples(own, replace(told, source=f"{source}, trajectory {label}")))
     return found
+
+
+def _samples(arrays: dict[str, ndarray | None], told: _Told) -> Samples:
+    """Return one trajectory, in the units of the equation."""
+    arrays, origin = _in_order(arrays, told)
+    t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
+    assert t is not None
+    assert u is not None
+    if origin.scale != 1:
+        u, v = u * origin.scale, None if v is None else v * origin.scale
+    return Samples(t, u, v, f, None, told.source, told.ends, origin)
+
+
+def _in_order(arrays: dict[str, ndarray | None], told: _Told) -> tuple[dict[str, ndarray | None], Origin]:
+    """Return arrays whose times increase.
+
+    Raises:
+        InputError: they do not, and were not to be sorted.
+    """
+    t = arrays["t"]
+    assert t is not None
+    steps = np.diff(t)
+    if not np.all(np.isfinite(t)) or np.all(steps > 0):
+        return arrays, told.origin
+    if not told.sort:
+        row = int(np.flatnonzero(steps <= 0)[0]) + 1
+        remedy = "--sort averages rows of the same time" if t[row] == t[row - 1] else "--sort puts the rows in order"
+        raise InputError(
+            f"{told.source}: row {row + 1}, column {told.time}: time {t[row]:g} after {t[row - 1]:g}; times must "
+            f"increase: {remedy}; several trajectories need a column 'trajectory'"
+        )
+    times, group = np.unique(t, return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    begins = np.flatnonzero(np.diff(group[order], prepend=-1))
+    found: dict[str, ndarray | None] = {"t": times}
+    for name in ("u", "v", "f"):
+        array = arrays[name]
+        if array is None:
+            found[name] = None
+            continue
+        seen = ~np.isnan(array[order])
+        total = np.add.reduceat(np.where(seen, array[order], 0), begins)
+        with np.errstate(invalid="ignore"):
+            found[name] = total / np.add.reduceat(seen, begins, dtype=float)
+    early = np.count_nonzero(steps < 0)
+    notes = [f"{early} row(s) came too late; all are put in the order of their times"] if early else []
+    if len(times) < len(t):
+        notes.append(f"{len(t) - len(times)} row(s) have the time of another one; such rows are averaged")
+    return found, told.origin.noting(*notes)
 
 
 # CSV and Parquet
 
 
-def _read_parquet(path: Path) -> pandas.DataFrame:
-    """Return a table of floats, NaN where a value is missing, and of labels."""
+def _read_parquet(path: Path, layout: Layout) -> Table:
+    """Return a table of floats, NaN where a value is missing, and of labels; the columns that are read."""
     import pandas as pd
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -122,24 +182,24 @@ def _read_parquet(path: Path) -> pandas.DataFrame:
     try:
         with reading(path, DATA) as handle, pq.ParquetFile(handle) as file:
             schema, about = file.schema_arrow, file.metadata
-            _check_count(about.num_rows * about.num_columns, path)
-            header = _named_once([name.strip() for name in schema.names], path)
-            _check_header(header, shown(path))
-            columns = {}
+            check_count(about.num_rows * about.num_columns, path)
+            header = named_once([name.strip() for name in schema.names], path)
+            chosen = set(choose(header, layout, shown(path)).names.values())
+            columns: dict[str, ndarray] = {}
             for name, kind, column in zip(header, schema.types, file.read().itercolumns(), strict=True):
-                if name == "trajectory" and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
-                    columns[name] = column.to_numpy()
-                    continue
-                _check_type(kind, name, path)
-                columns[name] = column.cast(pa.float64()).to_numpy()
+                if name not in chosen:
+                    columns[name] = np.full(about.num_rows, np.nan)
+                elif name == "trajectory" and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+                    columns[name] = column.to_numpy().astype(str)
+                else:
+                    _check_type(kind, name, path)
+                    columns[name] = column.cast(pa.float64()).to_numpy()
     except InputError:
         raise
     # A damaged file fails in many ways.
     except Exception as error:
         raise InputError(f"{shown(path)}: not a Parquet file: {str(error).partition(chr(10))[0]}") from None
-    if "trajectory" in columns:
-        columns["trajectory"] = columns["trajectory"].astype(str)
-    return pd.DataFrame(columns)
+    return Table(pd.DataFrame(columns))
 
 
 def _check_type(kind: pyarrow.DataType, name: str, path: Path) -> None:
@@ -153,67 +213,25 @@ def _check_type(kind: pyarrow.DataType, name: str, path: Path) -> None:
         )
 
 
-def _read_csv(path: Path) -> pandas.DataFrame:
-    """Return a table of texts, NaN where a cell is empty."""
-    import pandas as pd
+def from_frame(frame: pandas.DataFrame, source: str, ends: Ends = "unknown", layout: Layout = PLAIN) -> list[Samples]:
+    """Return the trajectories of a table with names of columns.
 
-    text = read_text(path, DATA).removeprefix("\ufeff")
-    _check_count(text.count(","), path)
-    try:
-        # The header is read as a row, so that a column that occurs twice is seen before pandas renames it.
-        raw = pd.read_csv(io.StringIO(text), header=None, comment="#", skipinitialspace=True, dtype=str)
-    except pd.errors.EmptyDataError:
-        raise InputError(f"{shown(path)}: the file is empty; its first line must be a header such as t,u1,u2") from None
-    except pd.errors.ParserError as error:
-        reason = str(error).strip().splitlines()[0].removeprefix("Error tokenizing data. C error: ")
-        raise InputError(
-            f"{shown(path)}: not a table: {reason}; every row needs as many values as the header"
-        ) from None
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{shown(path)}: not a table: {error}") from None
-    header = _named_once([str(name).strip()[:MOST_IN_A_CELL] for name in raw.iloc[0]], path)
-    body = raw.iloc[1:].reset_index(drop=True)
-    body.columns = pd.Index(header)
-    if body.iloc[:, -1].isna().any():
-        _refuse_short_rows(text, len(header), path)
-    return body
+    Raises:
+        InputError: a column is missing, or holds something else than numbers.
+    """
+    named = frame.rename(columns=str)
+    return _from_table(Table(named), source, ends, layout)
 
 
-def _named_once(header: list[str], path: Path) -> list[str]:
-    """Return a header, unless a column occurs twice."""
-    seen = set()
-    for name in header:
-        if name in seen:
-            raise InputError(f"{shown(path)}: the column {_quoted(name)} occurs twice; leave one out")
-        seen.add(name)
-    return header
-
-
-def _quoted(text: str) -> str:
-    """Return the beginning of a text of the user's in quotes."""
-    return repr(text if len(text) <= 40 else text[:37] + "...")
-
-
-def _refuse_short_rows(text: str, width: int, path: Path) -> None:
-    """Refuse rows that end early, as in a file that was cut off; pandas fills them up with gaps."""
-    rows = csv.reader(line.partition("#")[0] for line in io.StringIO(text, newline=""))
-    try:
-        for number, row in enumerate(row for row in rows if "".join(row).strip()):
-            if len(row) < width:
-                raise InputError(
-                    f"{shown(path)}: row {number}: it has {len(row)} value(s), the header {width}; the row was cut "
-                    "off, or a missing value needs its comma"
-                )
-    except csv.Error as error:
-        raise InputError(f"{shown(path)}: line {rows.line_num}: {error}; a cell holds one number") from None
-
-
-def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Samples]:
-    columns = list(table.columns)
-    _check_header(columns, source)
-    if len(table) == 0:
+def _from_table(table: Table, source: str, ends: Ends, layout: Layout) -> list[Samples]:
+    choice = choose(list(table.body.columns), layout, source, table.units)
+    if len(table.body) == 0:
         raise InputError(f"{source}: it has 0 row(s) of data; a motion needs at least 2")
-    numbers = {column: _numbers(table, column, source) for column in columns if column != "trajectory"}
+    body, origin = table.body, replace(choice.origin, notes=(*table.notes, *choice.origin.notes))
+    body, said = _with_seconds(body, choice.names["t"])
+    if said:
+        origin = replace(origin.noting(said), time="s")
+    numbers = {new: _numbers(body, old, source) for new, old in choice.names.items() if new != "trajectory"}
     u, v, f, real, imaginary = (_field(numbers, prefix, source) for prefix in ("u", "v", "f", "re", "im"))
     if (real is None) != (imaginary is None) or (u is None) == (real is None):
         raise InputError(f"{source}: give either columns u1..uN (real field) or re1..reN and im1..imN (complex field)")
@@ -228,23 +246,30 @@ def _from_table(table: pandas.DataFrame, source: str, ends: Ends) -> list[Sample
         if f is not None:
             raise InputError(f"{source}: both f and f1.. are there; keep one of them")
         f = np.repeat(numbers["f"][:, None], u.shape[1], axis=1)
-    labels = table["trajectory"].astype(str).to_numpy() if "trajectory" in columns else None
-    return _trajectories({"t": numbers["t"], "u": u, "v": v, "f": f}, labels, source, ends)
+    labels = body[choice.names["trajectory"]].astype(str).to_numpy() if "trajectory" in choice.names else None
+    arrays = {"t": numbers["t"], "u": u, "v": v, "f": f}
+    return _trajectories(arrays, labels, _Told(source, ends, origin, choice.names["t"], sort=layout.sort))
 
 
-def _check_header(columns: list[str], source: str) -> None:
-    """Refuse a table without times or with unknown columns."""
-    if any(sign in column for column in columns for sign in (";", "\t")):
-        raise InputError(f"{source}: the columns are separated by something else; separate them by commas")
-    if "t" not in columns:
-        raise InputError(
-            f"{source}: there is no column t; the header must be t,u1..uN[,v1..vN][,f1..fN] or t,re1..reN,im1..imN"
-        )
-    for column in columns:
-        if not re.fullmatch(r"t|f|trajectory|(u|v|f|re|im)[1-9]\d{0,5}", column):
-            raise InputError(
-                f"{source}: unknown column {_quoted(column)}; known: u1.., v1.., f1.. or f, re1.., im1.., t, trajectory"
-            )
+def _with_seconds(body: pandas.DataFrame, time: str) -> tuple[pandas.DataFrame, str]:
+    """Return a table whose times are numbers: dates and times of day become seconds after the first row."""
+    import pandas as pd
+
+    given = body[time]
+    if given.dtype.kind != "M":
+        first = str(given.iloc[0]).strip()
+        if not re.match(r"\d{4}-\d\d-\d\d|\d{1,2}:\d\d", first):
+            return body, ""
+        is_date = re.match(r"\d{4}-", first) is not None
+        texts = given.astype(str).str.strip().str.replace(",", ".", regex=False)
+        if is_date:
+            given = pd.to_datetime(texts, format="ISO8601", errors="coerce", utc=True)
+        else:
+            given = pd.to_timedelta(texts.str.replace(r"^(\d+:\d+)$", r"\1:00", regex=True), errors="coerce")
+        if given.isna().any():
+            return body, ""
+    since = (given - given.iloc[0]).dt.total_seconds()
+    return body.assign(**{time: since}), f"times are seconds after the first row, {body[time].iloc[0]}"
 
 
 NUMBER = r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)|nan"
@@ -253,18 +278,18 @@ NUMBER = r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)|nan"
 def _numbers(table: pandas.DataFrame, column: str, source: str) -> ndarray:
     """Return the values of a column, NaN where they are missing."""
     given = table[column]
-    if given.dtype.kind == "f":
-        return given.to_numpy()
+    if given.dtype.kind in "fiu":
+        return given.to_numpy(dtype=float)
     # Not by pandas, whose reader of numbers reads beyond the end of some damaged texts.
-    text = given.str.strip()
-    wrong = given.notna() & ~text.str.fullmatch(NUMBER, flags=re.ASCII | re.IGNORECASE, na=False)
+    text = given.astype("string").str.strip()
+    wrong = given.notna() & ~text.str.fullmatch(NUMBER, flags=re.ASCII | re.IGNORECASE, na=False).astype(bool)
     if wrong.any():
         row = int(np.flatnonzero(wrong.to_numpy())[0])
         raise InputError(
-            f"{source}: row {row + 1}, column {column}: {_quoted(given.iloc[row])} is not a number; "
+            f"{source}: row {row + 1}, column {column}: {quoted(str(given.iloc[row]))} is not a number; "
             "leave the cell empty if the value is missing"
         )
-    return np.array([float(value) for value in text.where(given.notna(), np.nan)])
+    return np.array([float(value) for value in text.where(given.notna(), "nan")])
 
 
 def _field(numbers: dict[str, ndarray], prefix: str, source: str) -> ndarray | None:
@@ -283,8 +308,10 @@ def _field(numbers: dict[str, ndarray], prefix: str, source: str) -> ndarray | N
 # NPZ
 
 
-def _read_npz(path: Path) -> dict[str, ndarray]:
+def _read_npz(path: Path, layout: Layout) -> dict[str, ndarray]:
     """Return the arrays, whose names, types and sizes are looked at before they are unpacked."""
+    if layout.time is not None or layout.columns:
+        raise InputError(f"{shown(path)}: it has arrays t and u, no columns; leave --time and --columns out")
     try:
         with reading(path, DATA) as handle:
             if handle.peek(1)[:1] != b"P":  # type: ignore[attr-defined]
@@ -296,7 +323,7 @@ def _read_npz(path: Path) -> dict[str, ndarray]:
                     raise ValueError("an array occurs twice")
                 _check_names(list(members), shown(path))
                 shapes = {name: _shape(archive, one, name, path) for name, one in members.items()}
-                _check_count(sum(int(np.prod(shape, dtype=object)) for shape in shapes.values()), path)
+                check_count(sum(int(np.prod(shape, dtype=object)) for shape in shapes.values()), path)
                 return {name: _array(archive, one) for name, one in members.items()}
     except InputError:
         raise
@@ -335,7 +362,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> ndarray:
         return found
 
 
-def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends) -> list[Samples]:
+def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends, layout: Layout) -> list[Samples]:
     _check_times(arrays["t"], source)
     t, labels = arrays["t"], arrays.get("trajectory")
     u, v, f = (_matrix(arrays, name, source) for name in ("u", "v", "f"))
@@ -344,17 +371,20 @@ def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends) -> list[Sa
         f = np.repeat(f, u.shape[1], axis=1)
     if labels is not None and labels.shape != t.shape:
         raise InputError(f"{source}: array trajectory has shape {labels.shape}; it must be {t.shape}")
-    return _trajectories({"t": t.astype(float), "u": u, "v": v, "f": f}, labels, source, ends)
+    becomes = UNITS[layout.unit][1] if layout.unit else ""
+    origin = Origin(unit=layout.unit, scale=layout.factor, becomes=becomes)
+    told = _Told(source, ends, origin, sort=layout.sort)
+    return _trajectories({"t": t.astype(float), "u": u, "v": v, "f": f}, labels, told)
 
 
 def _check_names(names: Sequence[str], source: str) -> None:
     """Refuse missing and unknown arrays."""
     for name in ("t", "u"):
         if name not in names:
-            raise InputError(f"{source}: the array {name!r} is missing; there are: {', '.join(map(_quoted, names))}")
+            raise InputError(f"{source}: the array {name!r} is missing; there are: {', '.join(map(quoted, names))}")
     for name in names:
         if name not in ARRAYS:
-            raise InputError(f"{source}: unknown array {_quoted(name)}; known: {', '.join(ARRAYS)}")
+            raise InputError(f"{source}: unknown array {quoted(name)}; known: {', '.join(ARRAYS)}")
 
 
 def _check_times(t: ndarray, source: str) -> None:

@@ -18,6 +18,31 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
 
+@dataclass(frozen=True)
+class Origin:
+    """How samples were read from a file: the units and names that it has. Numbers are in the units of the equation.
+
+    Attributes:
+        time: unit of the times; "" where it is not known.
+        unit: unit of the readings in the file; "" where it is not known.
+        scale: what one unit of a reading is in the equation: u = scale * reading.
+        becomes: unit of u in the equation; "" where it is not known.
+        columns: names of the sensors' columns; () where they are u1, u2, ...
+        notes: what else a user should know of the reading, a part of a sentence each.
+    """
+
+    time: str = ""
+    unit: str = ""
+    scale: float = 1.0
+    becomes: str = ""
+    columns: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def noting(self, *notes: str) -> Origin:
+        """Return the same with more to know."""
+        return replace(self, notes=(*self.notes, *notes))
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """What was observed of one trajectory.
@@ -30,6 +55,7 @@ class Samples:
         sigma: standard deviation of the noise on u, or None if it is not known.
         source: the file or simulation that they come from.
         ends: how the chain ends, as far as this is known.
+        origin: how they were read.
 
     Raises:
         InputError: shapes differ, times do not increase, or there is nothing to fit.
@@ -42,6 +68,7 @@ class Samples:
     sigma: float | None = None
     source: str = "samples"
     ends: Ends = "unknown"
+    origin: Origin = Origin()
 
     def __post_init__(self) -> None:
         """Check shapes, times and values, and protect the arrays from changes."""

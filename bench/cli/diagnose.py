@@ -13,6 +13,7 @@ import typer
 
 from latticebench.bench.cli.arguments import asked, told
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, check_places, complete_systems, place
+from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, layout_of, read_told
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ EPILOG = (
 
 
 def diagnose(
-    files: Annotated[list[Path], typer.Argument(help="One or more .csv, .npz or .parquet files.")],
+    files: Files,
     system: Annotated[
         str | None,
         typer.Option(help="Declare this system's equation, its coefficients free.", autocompletion=complete_systems),
@@ -57,6 +58,10 @@ def diagnose(
             help="Judge forecasts on this file, not on the last 30 % of the record; may be given several times.",
         ),
     ] = None,
+    time: Time = None,
+    columns: Columns = None,
+    scale: Scale = "1",
+    sort: Sort = False,
     json_out: JsonOut = None,
     html_out: Annotated[
         Path | None, typer.Option("--html", metavar="OUT", parser=place, help="Write one HTML file with pictures.")
@@ -70,13 +75,14 @@ def diagnose(
     from latticebench.systems.user_files import load_effects
 
     check_places([*files, *(holdout or ()), effects, system], json=json_out, html=html_out)
+    layout = layout_of(time, columns, scale, sort)
     known, declared, order = _declared(system, terms, order)
     catalogue = (*CATALOGUE, *(load_effects(effects) if effects is not None else ()))
     ends = ends or ("unknown" if known is None else known.ends)
-    data = read_all(files, ends)
+    data = read_told(files, ends, layout)
     _check_field(known, data)
     # Read together, since the two must be of the same chain.
-    later = read_all([*files, *holdout], ends)[len(data) :] if holdout else []
+    later = read_all([*files, *holdout], ends, layout)[len(data) :] if holdout else []
     with told(data, None, "the diagnosis"), watching() as watcher, redirect_stdout(sys.stderr):
         run = partial(repair.diagnose, declared, order, data, catalogue, held_out=later, watcher=watcher)
         found, interrupted = _as_far_as_it_came(run)

@@ -23,6 +23,7 @@ from latticebench.bench.cli.options import (
     TimeLimit,
     check_places,
 )
+from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, layout_of, read_told
 
 EPILOG = (
     "Examples:  latticebench fit phi4.csv --system phi4 --library lib2 --method stlsq --set threshold=0.1\n\n"
@@ -34,7 +35,7 @@ TIME_LIMIT, MEMORY_LIMIT = 3600.0, 4096
 
 
 def fit(
-    files: Annotated[list[Path], typer.Argument(help="One or more .csv, .npz or .parquet files.")],
+    files: Files,
     system: SystemOption = None,
     library: Library = None,
     terms: Terms = None,
@@ -47,6 +48,10 @@ def fit(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the method's own draws.")] = 1,
     time_limit: TimeLimit = None,
     memory_limit: MemoryLimit = None,
+    time: Time = None,
+    columns: Columns = None,
+    scale: Scale = "1",
+    sort: Sort = False,
     json_out: JsonOut = None,
 ) -> None:
     """Fit the coefficients of a library to recorded samples.
@@ -59,10 +64,10 @@ def fit(
     from latticebench.bench.report.screen import show_fit, waiting
     from latticebench.methods.method import make
     from latticebench.systems.files import check_regular, write_text
-    from latticebench.systems.readers import read_all
 
     method = methods.DEFAULT if method is None else method
     check_places([*files, system, method], json=json_out)
+    layout = layout_of(time, columns, scale, sort)
     own = code_file(method)
     if own is None:
         make(methods.find(method), pairs(given), texts=True)
@@ -71,10 +76,10 @@ def fit(
     # What a file of the user's prints is for people, not for a program that reads the result.
     with redirect_stdout(sys.stderr):
         _, candidates, order = asked(system, library, terms, order)
-    data = read_all(files, ends)
+    data = read_told(files, ends, layout)
     asked_for = Apart(
         files=tuple(files), ends=ends, terms=candidates.texts, order=order, method=method, settings=pairs(given),
-        seed=seed, time_limit=time_limit or TIME_LIMIT, memory_limit=memory_limit or MEMORY_LIMIT,
+        seed=seed, time_limit=time_limit or TIME_LIMIT, memory_limit=memory_limit or MEMORY_LIMIT, layout=layout,
     )  # fmt: skip
     with told(data, method, f"method {method!r}"), waiting(f"{method}: fitting {len(candidates.terms)} terms"):
         if own is None and time_limit is None and memory_limit is None:

@@ -13,6 +13,7 @@ import typer
 from latticebench.bench.cli.arguments import asked, case_of, numbers, told
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, Yes, check_places, complete_systems
 from latticebench.bench.cli.options import Library as LibraryName
+from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, layout_of, read_told
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,6 +59,10 @@ def limit(
     trajectories: Annotated[int | None, typer.Option(help="Number of trajectories; 1 if not given.")] = None,
     velocities: Annotated[bool | None, typer.Option(help="Whether velocities are seen (second-order systems).")] = None,
     initial: Annotated[str | None, typer.Option(help="Initial state; the system's first if not given.")] = None,
+    time: Time = None,
+    columns: Columns = None,
+    scale: Scale = "1",
+    sort: Sort = False,
     json_out: JsonOut = None,
     yes: Yes = False,
 ) -> None:
@@ -73,10 +78,11 @@ def limit(
         "trajectories": trajectories, "velocities": velocities, "initial": initial,
     }  # fmt: skip
     described = {name: value for name, value in simulated.items() if value is not None}
+    layout = layout_of(time, columns, scale, sort)
     if files:
         for name in described:
             raise InputError(f"--{name}: files are given, whose samples are as they are; leave it out, or the files")
-        note, bound_at = _of_recordings(files, candidates, order, ends or "unknown")
+        note, bound_at = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
     else:
@@ -94,14 +100,12 @@ def limit(
 BoundAt = Callable[[int, int], "Limit"]
 
 
-def _of_recordings(files: Sequence[Path], candidates: Library, order: int, ends: AnyEnds) -> tuple[str, BoundAt]:
+def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> tuple[str, BoundAt]:
     """Return where the bound of recorded samples is taken, and the bound."""
     from latticebench.bench.limit import denser
     from latticebench.bench.noise import left_by
     from latticebench.bench.report.screen import waiting
-    from latticebench.systems.readers import read_all
 
-    data = read_all(files, ends)
     with waiting(f"fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
         fit = _followed(data, candidates, order)
     left = left_by(data, fit)

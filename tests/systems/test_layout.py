@@ -1,0 +1,198 @@
+"""A recording as it comes from a laboratory is read rightly and said so, or refused with the option that reads it."""
+
+import numpy as np
+import openpyxl
+import pandas as pd
+import pytest
+
+from latticebench.systems.errors import InputError
+from latticebench.systems.layout import Layout, unit_of
+from latticebench.systems.readers import from_frame, read, read_all
+
+PENDULA = Layout("time_s", ("theta_*_deg",), "deg")
+U = np.array([[10.5, -20.25], [11.0, np.nan], [-3.0, 4.0]])
+
+
+def lines(separator, decimal=".", *, above="", head="time_s,theta_1_deg,theta_2_deg,temperature"):
+    rows = [head.replace(",", separator)]
+    for t, row in zip((0.0, 0.5, 1.0), U, strict=True):
+        cells = [f"{t}", *("" if np.isnan(one) else f"{one}" for one in row), "21.5"]
+        rows.append(separator.join(cell.replace(".", decimal) for cell in cells))
+    return above + "\n".join(rows) + "\n"
+
+
+def written(tmp_path, text, name="a.csv", encoding="utf-8"):
+    path = tmp_path / name
+    path.write_text(text, encoding=encoding)
+    return path
+
+
+def assert_pendula(path, layout=PENDULA):
+    (one,) = read(path, "free", layout)
+    np.testing.assert_array_equal(one.t, [0, 0.5, 1])
+    np.testing.assert_allclose(one.u, np.deg2rad(U), rtol=1e-15)
+    assert (one.origin.time, one.origin.unit, one.origin.becomes) == ("s", "deg", "rad")
+    assert one.origin.columns == ("theta_1_deg", "theta_2_deg")
+    assert "not read: temperature" in one.origin.notes
+    return one
+
+
+@pytest.mark.parametrize(("separator", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_separators_decimal_commas_and_byte_order_marks_change_nothing(tmp_path, separator, decimal, encoding):
+    one = assert_pendula(written(tmp_path, lines(separator, decimal), encoding=encoding))
+    assert ("decimals are written with commas" in one.origin.notes) == (decimal == ",")
+
+
+def test_rows_above_the_table_are_skipped_and_counted(tmp_path):
+    above = "Torsion chain, run 3\nOperator: R. M., t = 20 C\n# a remark\n\n"
+    one = assert_pendula(written(tmp_path, lines(";", ",", above=above)))
+    assert "2 row(s) above the table were skipped" in one.origin.notes
+
+
+def test_a_table_of_spaces_and_a_header_in_a_remark_are_read(tmp_path):
+    path = tmp_path / "a.txt"
+    np.savetxt(path, np.column_stack([[0, 1, 2], U[:, 0], U[:, 0]]), header="t x_1 x_2")
+    (one,) = read(path, layout=Layout(columns=("x_*",)))
+    np.testing.assert_array_equal(one.u, U[:, [0, 0]])
+
+
+def test_the_units_are_found_in_names_and_in_a_row_of_their_own(tmp_path):
+    for name, unit in {
+        "theta_1_deg": "deg", "x (mm)": "mm", "x [°]": "deg", "x / mV": "mV", "angle deg": "deg", "t_ms": "ms",
+        "theta_1": "", "u1": "", "x_total": "", "x (a note of the lab)": "",
+    }.items():  # fmt: skip
+        assert unit_of(name) == unit, name
+    text = "time;x1;x2\n[ms];[mm];[mm]\n0;1;2\n5;2;3\n"
+    (one,) = read(written(tmp_path, text), layout=Layout("time", ("x*",), "mm"))
+    assert (one.origin.time, one.origin.unit, one.origin.becomes) == ("ms", "mm", "m")
+    np.testing.assert_allclose(one.u, [[1e-3, 2e-3], [2e-3, 3e-3]])
+    # Old German programs write degrees in Windows-1252.
+    text = "Zeit (s);Winkel 1 (°)\n0;1,5\n1;2,5\n"
+    (one,) = read(written(tmp_path, text, encoding="cp1252"), layout=Layout("Zeit (s)", ("Winkel *",), "deg"))
+    assert one.origin.unit == "deg"
+    np.testing.assert_allclose(one.u[:, 0], np.deg2rad([1.5, 2.5]))
+
+
+def test_columns_of_a_pattern_come_in_the_order_of_their_numbers_and_those_of_a_list_in_its_order(tmp_path):
+    path = written(tmp_path, "t,x10,x2,x1\n0,10,2,1\n1,10,2,1\n")
+    np.testing.assert_array_equal(read(path, layout=Layout(columns=("x*",)))[0].u[0], [1, 2, 10])
+    np.testing.assert_array_equal(read(path, layout=Layout(columns=("x10,x1", "x2")))[0].u[0], [10, 1, 2])
+    path = written(tmp_path, "t,a [mm],b [mm]\n0,1,2\n1,1,2\n")
+    np.testing.assert_array_equal(read(path, layout=Layout(columns=("* [mm]",)))[0].u[0], [1, 2])
+
+
+def test_velocities_and_inputs_keep_their_standard_names_beside_chosen_columns(tmp_path):
+    path = written(tmp_path, "t,x1,v1,f,u1\n0,1,2,3,9\n1,1,2,3,9\n")
+    (one,) = read(path, layout=Layout(columns=("x*",), scale="0.5"))
+    assert (one.u[0, 0], one.v[0, 0], one.f[0, 0]) == (0.5, 1.0, 3.0)
+    assert "not read: u1" in one.origin.notes
+
+
+def test_a_spreadsheet_is_read_as_the_table_that_it_holds(tmp_path):
+    book = openpyxl.Workbook()
+    book.active.append(["Torsion chain"])
+    book.active.append(["time_s", "theta_1_deg", "theta_2_deg", "temperature"])
+    for t, row in zip((0.0, 0.5, 1.0), U, strict=True):
+        book.active.append([t, *(None if np.isnan(one) else one for one in row), 21.5])
+    book.create_sheet("Remarks")
+    book.save(tmp_path / "a.xlsx")
+    one = assert_pendula(tmp_path / "a.xlsx")
+    assert "sheet 'Sheet' is read, not 'Remarks'" in one.origin.notes
+    with pytest.raises(InputError, match="--time time_s --columns"):
+        read(tmp_path / "a.xlsx")
+
+
+def test_a_parquet_with_other_columns_and_a_frame_are_read(tmp_path):
+    frame = pd.DataFrame(
+        {"time_s": [0.0, 0.5, 1.0], "theta_1_deg": U[:, 0], "theta_2_deg": U[:, 1], "temperature": list("abc")}
+    )
+    frame.to_parquet(tmp_path / "a.parquet")
+    assert_pendula(tmp_path / "a.parquet")
+    (one,) = from_frame(frame, "frame", "free", PENDULA)
+    np.testing.assert_allclose(one.u, np.deg2rad(U), rtol=1e-15)
+
+
+def test_what_cannot_be_read_as_it_is_names_the_options_that_read_it(tmp_path):
+    path = written(tmp_path, lines(";", ",", above="Run 3\n"))
+    with pytest.raises(InputError) as caught:
+        read(path)
+    options = '--time time_s --columns "theta_*_deg" --scale deg'
+    assert options in str(caught.value)
+    assert_pendula(path)
+
+
+def test_times_that_do_not_increase_are_refused_with_the_option_that_sorts_them(tmp_path):
+    path = written(tmp_path, "t,u1\n0,1\n2,3\n1,2\n2,5\n")
+    with pytest.raises(InputError, match=r"row 3, column t: time 1 after 2; .*--sort"):
+        read(path)
+    (one,) = read(path, layout=Layout(sort=True))
+    np.testing.assert_array_equal(one.t, [0, 1, 2])
+    np.testing.assert_array_equal(one.u[:, 0], [1, 2, 4])
+    assert [note for note in one.origin.notes if "averaged" in note]
+    with pytest.raises(InputError, match="--sort averages"):
+        read(written(tmp_path, "t,u1\n0,1\n0,2\n1,2\n"))
+
+
+def test_an_average_leaves_missing_values_out(tmp_path):
+    path = written(tmp_path, "t,u1,u2\n0,1,\n0,,\n1,2,3\n")
+    (one,) = read(path, layout=Layout(sort=True))
+    np.testing.assert_array_equal(one.u, [[1, np.nan], [2, 3]])
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [("2026-01-05T12:00:00", "2026-01-05T12:00:01.5"), ("12:00:00", "12:00:01,5"), ("11:59:59.5", "12:00:01")],
+)
+def test_dates_and_times_of_day_become_seconds(tmp_path, first, second):
+    (one,) = read(written(tmp_path, f"t;u1\n{first};1\n{second};2\n"))
+    np.testing.assert_allclose(one.t, [0, 1.5])
+    assert one.origin.time == "s"
+
+
+def test_additional_columns_are_left_out_and_named(tmp_path):
+    (one,) = read(written(tmp_path, "t,u1,speed\n0,1,x\n1,2,y\n"))
+    assert one.origin.notes == ("not read: speed",)
+
+
+@pytest.mark.parametrize(
+    ("layout", "words"),
+    [
+        (Layout("tme_s"), ["--time", "did you mean 'time_s'"]),
+        (Layout("time_s", ("phi_*",)), ["--columns", "'phi_*'"]),
+        (Layout("time_s", ("theta_1_deg", "theta_*_deg")), ["'theta_1_deg' is named twice"]),
+        (Layout("time_s", ("*_*",)), ["--columns", "'time_s' is the column of the times"]),
+        (Layout("time_s", ("theta_1_deg", "temperature")), ["different units"]),
+        (Layout("time_s", ("theta_*_deg",), "mm"), ["--scale mm", "in deg"]),
+        (Layout("time_s", ("theta_*_deg",), "furlong"), ["--scale", "'furlong'"]),
+        (Layout("time_s", ("theta_*_deg",), "0"), ["--scale", "'0'"]),
+        (Layout("time_s"), ["u1..uN", '--columns "theta_*_deg"']),
+    ],
+    ids=str,
+)
+def test_a_wrong_layout_is_told(tmp_path, layout, words):
+    with pytest.raises(InputError) as caught:
+        read(written(tmp_path, lines(",")), layout=layout)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_points_among_decimal_commas_are_refused_by_their_place(tmp_path):
+    path = written(tmp_path, "t;u1\n0;1,5\n1;2.5\n2;3,5\n")
+    with pytest.raises(InputError, match="row 1, column u1: '1,5'"):
+        read(path)
+
+
+def test_files_in_different_units_are_not_read_together(tmp_path):
+    first = written(tmp_path, "t,x (mm)\n0,1\n1,2\n", "a.csv")
+    second = written(tmp_path, "t,x (cm)\n0,1\n1,2\n", "b.csv")
+    with pytest.raises(InputError, match=r"b\.csv: readings in cm, those of .*a\.csv in mm"):
+        read_all([first, second], layout=Layout(columns=("x*",)))
+
+
+def test_columns_are_not_chosen_in_an_archive_of_arrays(tmp_path):
+    np.savez(tmp_path / "a.npz", t=np.arange(3), u=np.ones((3, 1)))
+    with pytest.raises(InputError, match="leave --time and --columns out"):
+        read(tmp_path / "a.npz", layout=PENDULA)
+    (one,) = read(tmp_path / "a.npz", layout=Layout(scale="deg"))
+    np.testing.assert_allclose(one.u, np.pi / 180)
