@@ -83,6 +83,13 @@ def fields_of(samples: Samples, order: int) -> list[ndarray]:
     return [samples.u] if order == 1 or samples.v is None else [samples.u, samples.v]
 
 
+def centred(field: ndarray) -> ndarray:
+    """Return readings about the middle of each sensor's: digits of a large constant would hide those of the motion."""
+    with np.errstate(invalid="ignore"):
+        middle = np.array([np.mean(one[np.isfinite(one)]) if np.any(np.isfinite(one)) else 0.0 for one in field.T])
+    return np.asarray(field - middle)
+
+
 def readings(samples: Samples, order: int) -> Channels:
     """Return the numbers of u and, for order 2 if it was observed, v as rows; NaN where nothing was read."""
     fields = fields_of(samples, order)
@@ -150,7 +157,7 @@ def _ratios(
     """Return what is left at each sensor that shows its noise by itself, in units of that."""
     longest = max(data, key=lambda one: len(one.t))
     fields = fields_of(longest, order)
-    shown = np.concatenate([of_readings(longest.t, one) for one in fields])
+    shown = np.concatenate([of_readings(longest.t, centred(one)) for one in fields])
     # Single outliers are no misfit.
     heavy = np.isfinite(noise.tail)
     own = np.full(len(shown), np.nan)
@@ -187,6 +194,7 @@ def _lines(data: Sequence[Samples], noise: Noise, order: int) -> Iterator[str]:
     interval = float(np.median(np.diff(first.t)))
     for level, field in enumerate(fields_of(first, order)):
         own = slice(level * first.sites, (level + 1) * first.sites)
-        steps = [step_of(split_parts(field[:, k : k + 1], first.is_complex).ravel()) for k in range(first.sites)]
+        middled = centred(field)
+        steps = [step_of(split_parts(middled[:, k : k + 1], first.is_complex).ravel()) for k in range(first.sites)]
         part = replace(noise, size=noise.size[own], memory=noise.memory[own])
         yield from (("velocity, " if level else "") + line for line in describe(part, steps, interval=interval))

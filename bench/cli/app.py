@@ -17,7 +17,20 @@ from typing import Annotated
 import typer
 
 import latticebench
-from latticebench.bench.cli import compare, data, diagnose, figures, fit, limit, listing, run, schema, simulate, table
+from latticebench.bench.cli import (
+    compare,
+    data,
+    diagnose,
+    figures,
+    fit,
+    inspect,
+    limit,
+    listing,
+    run,
+    schema,
+    simulate,
+    table,
+)
 from latticebench.bench.threads import prefer_one_thread
 from latticebench.systems.errors import InputError, printable
 from latticebench.systems.files import LARGEST
@@ -59,6 +72,7 @@ def program(
 
 app.command("list", epilog=listing.EPILOG)(listing.list_)
 app.command(epilog=simulate.EPILOG)(simulate.simulate)
+app.command(epilog=inspect.EPILOG)(inspect.inspect)
 app.command(epilog=fit.EPILOG)(fit.fit)
 app.command(epilog=diagnose.EPILOG)(diagnose.diagnose)
 app.add_typer(data.app, name="data")

@@ -59,9 +59,12 @@ def fit(
     A method of your own (.py) runs in a process of its own, within the limits; so does any method where one is given.
     """
     from latticebench import methods
+    from latticebench.bench.adequacy import adequacy
     from latticebench.bench.apart import Apart, fit_apart, fit_here
     from latticebench.bench.case import code_file
+    from latticebench.bench.inspection import sine_warning
     from latticebench.bench.report.screen import show_fit, waiting
+    from latticebench.bench.report.units import in_words, units_of
     from latticebench.methods.method import make
     from latticebench.systems.files import check_regular, write_text
 
@@ -86,14 +89,17 @@ def fit(
             found = fit_here(asked_for, data, candidates)
         else:
             found = fit_apart(asked_for, candidates)
+        with redirect_stdout(sys.stderr):
+            quality = adequacy(data, found).also(sine_warning(data, candidates))
+    units = units_of(data[0].origin)
     if json_out != "-":
-        show_fit(found)
+        show_fit(found, quality, in_words(units))
     if json_out is None:
         return
     from latticebench.bench.report.document import provenance, to_json
     from latticebench.bench.report.outputs import fit_document
 
-    text = to_json(fit_document(found, provenance([seed])))
+    text = to_json(fit_document(found, quality, units, provenance([seed])))
     if json_out == "-":
         print(text, end="")
     else:

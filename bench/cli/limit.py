@@ -82,7 +82,7 @@ def limit(
     if files:
         for name in described:
             raise InputError(f"--{name}: files are given, whose samples are as they are; leave it out, or the files")
-        note, bound_at = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
+        note, bound_at, warnings = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
     else:
@@ -93,15 +93,16 @@ def limit(
             **{"noise": 0.01, **described},
         )  # fmt: skip
         note, bound_at = _of_simulated(case, None if yes else case.sites or known.sites)
-    _report(note, bound_at, target, json_out)
+        warnings = ()
+    _report(note, bound_at, target, json_out, warnings)
 
 
 # A bound for so many times the samples in the same time, and for a record so many times as long.
 BoundAt = Callable[[int, int], "Limit"]
 
 
-def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> tuple[str, BoundAt]:
-    """Return where the bound of recorded samples is taken, and the bound."""
+def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> tuple[str, BoundAt, tuple[str, ...]]:
+    """Return where the bound of recorded samples is taken, the bound, and why it may not hold."""
     from latticebench.bench.limit import denser
     from latticebench.bench.noise import left_by
     from latticebench.bench.report.screen import waiting
@@ -119,7 +120,7 @@ def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> 
         f"{data[0].source}: bound along the motion that {fit.method!r} fits to the samples, with the noise that it "
         "leaves" + ("" if fit.status == "ok" else f" ({fit.status})")
     )
-    return "\n".join([note, *(f"noise of {line}" for line in left.lines), *left.warning]), bound_at
+    return "\n".join([note, *(f"noise of {line}" for line in left.lines)]), bound_at, left.warning
 
 
 def _followed(data: Sequence[Samples], candidates: Library, order: int) -> Fit:
@@ -147,7 +148,7 @@ def _of_simulated(case: FitCase, sites: int | None) -> tuple[str, BoundAt]:
     return f"{case.data}: bound at the truth of the system", bound_at
 
 
-def _report(note: str, bound_at: BoundAt, target: float, json_out: str | None) -> None:
+def _report(note: str, bound_at: BoundAt, target: float, json_out: str | None, warnings: tuple[str, ...]) -> None:
     """Take the bound and show it, or write it as JSON."""
     from latticebench.bench.limit import design
     from latticebench.bench.report.screen import show_limit, waiting
@@ -157,13 +158,13 @@ def _report(note: str, bound_at: BoundAt, target: float, json_out: str | None) -
         found = bound_at(1, 1)
         needed = design(bound_at, target=target)
     if json_out != "-":
-        show_limit(found, needed, note)
+        show_limit(found, needed, note, warnings)
     if json_out is None:
         return
     from latticebench.bench.report.document import provenance, to_json
     from latticebench.bench.report.outputs import limit_document
 
-    text = to_json(limit_document(found, needed, note, provenance([1])))
+    text = to_json(limit_document(found, needed, note, provenance([1]), warnings))
     if json_out == "-":
         print(text, end="")
     else:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, cast
 
+import numpy as np
 import pydantic
 
 from latticebench.bench.report.document import Content, Document, Number, Pair, Provenance
@@ -16,9 +17,14 @@ from latticebench.bench.report.horizons import HorizonReport, horizons
 from latticebench.bench.report.modes import Modes, modes
 from latticebench.bench.report.notes import notes
 from latticebench.bench.report.separation import Separation, separations
+from latticebench.bench.report.units import Units, in_sentence, noise_in_words, units_of
 from latticebench.bench.report.whereabouts import Whereabouts, whereabouts
+from latticebench.diagnosis.instrument import step_of
+from latticebench.methods.engine.dynamics import split_parts
 
 if TYPE_CHECKING:
+    from latticebench.diagnosis.acting import Chain
+    from latticebench.diagnosis.fitting import Fitted
     from latticebench.diagnosis.repair import Diagnosis
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unexplained"]
@@ -34,6 +40,7 @@ class RecordingSummary(Content):
         trajectories: how many there are.
         field: "real" or "complex".
         ends: how the chain ends.
+        units: of times, readings and the equation.
     """
 
     sources: tuple[str, ...]
@@ -42,6 +49,7 @@ class RecordingSummary(Content):
     trajectories: int
     field: Literal["real", "complex"]
     ends: str
+    units: Units
 
 
 class Errors(Content):
@@ -147,19 +155,22 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
     """Return the content of a diagnosis, or of what was known when it was interrupted."""
     before, before_errors = declared(diagnosis.before)
     after, after_errors = declared(diagnosis.after)
+    units = units_of(diagnosis.data[0].origin)
     found, chain = added(diagnosis), diagnosis.after.chain
+    size = abs(units.scale)
     sensors = [f"{letter}{site + 1}" for letter in "uv"[: chain.levels] for site in range(chain.sites)]
     return Report(
         verdict=cast(Verdict, diagnosis.verdict), sentence=_sentence(diagnosis.verdict, found),
         recording=_recording(diagnosis),
         declared=after, declared_before=before, declared_stderr=after_errors, declared_stderr_before=before_errors,
         declared_truth=None if diagnosis.truth is None else dict(zip(after, map(float, diagnosis.truth), strict=True)),
-        noise=dict(zip(sensors, map(float, diagnosis.noise), strict=True)), noise_lines=diagnosis.noise_lines,
+        noise=dict(zip(sensors, map(float, diagnosis.noise / size), strict=True)),
+        noise_lines=_noise_lines(diagnosis, units),
         effects=found, separations=separations(diagnosis),
         equation=Equations(
-            before=equation(diagnosis.before.model, chain), after=equation(diagnosis.after.model, chain)
+            before=_equation(diagnosis.before, chain, units), after=_equation(diagnosis.after, chain, units)
         ),
-        modes=modes(diagnosis), horizons=horizons(diagnosis), error=_errors(diagnosis),
+        modes=modes(diagnosis), horizons=horizons(diagnosis), error=_errors(diagnosis, size),
         where=Where(before=whereabouts(diagnosis.before, diagnosis), after=whereabouts(diagnosis.after, diagnosis)),
         left=tuple(
             Left(effect=one.name, site=None if one.site is None else one.site + 1, gain=one.gain, price=one.price)
@@ -195,16 +206,36 @@ def _recording(diagnosis: Diagnosis) -> RecordingSummary:
     return RecordingSummary(
         sources=tuple(dict.fromkeys(samples.source for samples in data)), sites=data[0].sites,
         rows=sum(len(samples.t) for samples in data), trajectories=len(data),
-        field="complex" if data[0].is_complex else "real", ends=data[0].ends,
+        field="complex" if data[0].is_complex else "real", ends=data[0].ends, units=units_of(data[0].origin),
     )  # fmt: skip
 
 
-def _errors(diagnosis: Diagnosis) -> Errors:
+def _noise_lines(diagnosis: Diagnosis, units: Units) -> tuple[str, ...]:
+    """Return the noise in words, in the unit of the readings where it is known."""
+    if not units.reading and units.scale == 1:
+        return diagnosis.noise_lines
+    first = diagnosis.data[0]
+    noise, interval = diagnosis.after.noise, float(np.median(np.diff(first.t)))
+    fields = [first.u] if len(noise.size) == first.sites or first.v is None else [first.u, first.v]
+    steps = [step_of(split_parts(one[:, k], first.is_complex).ravel()) for one in fields for k in range(first.sites)]
+    return tuple(noise_in_words(noise, steps, interval, first.sites, units))
+
+
+def _equation(fitted: Fitted, chain: Chain, units: Units) -> Equation:
+    """Return the equation of a fitted model, with units in its sentences."""
+    found = equation(fitted.model, chain)
+    return found.model_copy(update={"elsewhere": tuple(in_sentence(line, units) for line in found.elsewhere)})
+
+
+def _errors(diagnosis: Diagnosis, size: float) -> Errors:
+    """Return the errors; `size` is what one unit of a reading is in the equation."""
+
     def pair(values: tuple[float, float]) -> Pair:
         return Pair(before=values[0], after=values[1])
 
+    before, after = diagnosis.rms
     return Errors(
-        residual=pair(diagnosis.residual), rms=pair(diagnosis.rms), forecast=pair(diagnosis.forecast),
+        residual=pair(diagnosis.residual), rms=pair((before / size, after / size)), forecast=pair(diagnosis.forecast),
         coefficients=None if diagnosis.coefficients is None else pair(diagnosis.coefficients),
         criterion=pair(diagnosis.criterion), dynamics=pair(diagnosis.dynamics),
     )  # fmt: skip

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.report.document import Content, Number
+from latticebench.bench.report.units import Units, in_sentence, of_natural, units_of
 from latticebench.diagnosis.acting import Placed
 
 if TYPE_CHECKING:
@@ -25,10 +26,11 @@ STEP = 1e-3
 
 
 class Size(Content):
-    """A number with its standard error."""
+    """A number with its standard error and its unit; "" where it has none or none is known."""
 
     value: Number
     stderr: Number
+    unit: str = ""
 
 
 class AddedEffect(Content):
@@ -56,8 +58,12 @@ class AddedEffect(Content):
 
 
 def added(diagnosis: Diagnosis) -> tuple[AddedEffect, ...]:
-    """Return the effects that were found, in the order in which the diagnosis gives them."""
+    """Return the effects that were found, in the order in which the diagnosis gives them.
+
+    Natural forms and sentences are in the units of the recording, coefficients in those of the equation.
+    """
     chain = diagnosis.after.chain
+    units = units_of(diagnosis.data[0].origin)
     frequency = min((one.frequency for one in diagnosis.modes[0]), default=float("nan"))
 
     def natural(placed: Placed) -> dict[str, float]:
@@ -70,12 +76,19 @@ def added(diagnosis: Diagnosis) -> tuple[AddedEffect, ...]:
         errors |= {name: size.stderr for name, size in settings.items() if np.isfinite(size.stderr)}
         found.append(
             AddedEffect(
-                effect=one.name, said=tuple(placed.sentences(chain)), parameters=placed.settings(),
+                effect=one.name, said=tuple(in_sentence(line, units) for line in placed.sentences(chain)),
+                parameters=placed.settings(),
                 coefficients=dict(zip(labels, placed.strength, strict=True)), stderr=errors,
-                natural=_with_errors(one, natural), evidence=one.evidence, indistinguishable=one.alternatives,
+                natural={name: _in_units(name, size, units) for name, size in _with_errors(one, natural).items()},
+                evidence=one.evidence, indistinguishable=one.alternatives,
             )
         )  # fmt: skip
     return tuple(found)
+
+
+def _in_units(name: str, size: Size, units: Units) -> Size:
+    factor, unit = of_natural(name, units)
+    return Size(value=size.value * factor, stderr=size.stderr * abs(factor), unit=unit)
 
 
 def _with_errors(one: Finding, function: Callable[[Placed], Mapping[str, float | int | str]]) -> dict[str, Size]:

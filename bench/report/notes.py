@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.bench.report.units import with_unit
 from latticebench.diagnosis.instrument import step_of
 from latticebench.systems.samples import Samples
 
@@ -31,7 +32,8 @@ def strays(samples: Samples) -> list[str]:
             row, others = seen[np.argmax(away)], np.sort(away)[:-1]
             if np.max(away) > STRAY * others[-1] > 0:
                 found.append(
-                    f"{samples.source}: {letter}{site + 1} at t = {samples.t[row]:g} is {column[row]:.4g}, more than "
+                    f"{samples.source}: {letter}{site + 1} at t = {samples.t[row]:g} is "
+                    f"{column[row] / samples.origin.scale:.4g}, more than "
                     f"{STRAY:g} times as far out as any other reading of that site. If it is a slip, leave the cell "
                     "empty."
                 )
@@ -59,12 +61,15 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
 def _steps(diagnosis: Diagnosis) -> Iterator[str]:
     """Yield what the steps of converters make of the noise."""
     found: dict[tuple[str, str], list[str]] = {}
+    origin = diagnosis.data[0].origin
     for site in range(diagnosis.data[0].sites):
         step = min(step_of(_parts(samples.u[:, site])) for samples in diagnosis.data)
         share = step**2 / 12 / float(diagnosis.noise[site]) ** 2 if diagnosis.noise[site] > 0 else 0.0
         if step and share > ROUNDING:
             size = f"{100 * share:.2g} %" if share < 1 else "all"
-            found.setdefault((f"{step:.4g}", size), []).append(f"u{site + 1}")
+            found.setdefault((with_unit(f"{step / abs(origin.scale):.4g}", origin.unit), size), []).append(
+                f"u{site + 1}"
+            )
     for (step_, size), columns in found.items():
         listed = "The readings" if len(columns) == diagnosis.data[0].sites else f"Readings of {', '.join(columns)}"
         yield f"{listed} are multiples of {step_}: rounding alone makes {size} of the noise's variance."

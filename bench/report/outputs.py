@@ -9,15 +9,27 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, JsonValue
 
 from latticebench.bench.report.document import Content, Document, Number, Provenance
+from latticebench.bench.report.units import Units
 
 if TYPE_CHECKING:
+    from latticebench.bench.adequacy import Adequacy
     from latticebench.bench.compare import Comparison
+    from latticebench.bench.inspection import Inspection
     from latticebench.bench.limit import Design, Limit
     from latticebench.methods.method import Fit
 
 # pandas has NaN where a text or a truth value is missing.
 Text = Annotated[str | None, BeforeValidator(lambda value: None if value != value else value)]
 Flag = Annotated[bool | None, BeforeValidator(lambda value: None if value != value else value)]
+
+
+class Quality(Content):
+    """How well an equation fits, see `bench.adequacy.Adequacy`."""
+
+    work: Number
+    r2: Number
+    times: Number
+    fits: bool
 
 
 class FitDocument(Document):
@@ -29,6 +41,9 @@ class FitDocument(Document):
         residual: RMS of what the equation leaves of the derivative over the RMS of the derivative.
         seconds: wall time of the fit alone.
         status: "ok", or what to know about the fit.
+        quality: how well the equation describes the readings.
+        warnings: what has to be known before a number is used; empty where the equation fits.
+        units: of times, readings and the equation.
     """
 
     schema_: Literal["latticebench/fit/1"] = Field(
@@ -41,6 +56,9 @@ class FitDocument(Document):
     residual: Number
     seconds: Number
     status: str
+    quality: Quality
+    warnings: list[str]
+    units: Units
 
 
 class TermLimit(Content):
@@ -75,6 +93,7 @@ class LimitDocument(Document):
         terms: by term.
         groups: terms that are hard to tell apart.
         needed: what a smaller error needs.
+        warnings: why the bound may not hold; empty where nothing speaks against it.
     """
 
     schema_: Literal["latticebench/limit/1"] = Field(
@@ -89,6 +108,7 @@ class LimitDocument(Document):
     terms: dict[str, TermLimit]
     groups: list[list[str]]
     needed: Needed
+    warnings: list[str]
 
 
 class FitRow(Content):
@@ -209,6 +229,46 @@ class CompareDocument(Document):
     new: list[str]
 
 
+class SensorReadings(Content):
+    """The readings of one sensor, see `bench.inspection.Sensor`."""
+
+    name: str
+    readings: int
+    missing: int
+    least: Number
+    most: Number
+    noise: Number
+    step: Number
+
+
+class Inspected(Content):
+    """What one trajectory is like, see `bench.inspection.Inspection`."""
+
+    source: str
+    sites: int
+    rows: int
+    begin: Number
+    end: Number
+    interval: Number
+    uneven: bool
+    gaps: list[tuple[float, float]]
+    seen: list[str]
+    sensors: list[SensorReadings]
+    frequencies: list[float]
+    suspicious: list[str]
+    notes: list[str]
+
+
+class InspectionDocument(Document):
+    """What recordings are like, see `latticebench inspect`; readings, times and frequencies are in the files' units."""
+
+    schema_: Literal["latticebench/inspection/1"] = Field(
+        default="latticebench/inspection/1", validation_alias="schema", serialization_alias="schema"
+    )
+    units: Units
+    trajectories: list[Inspected]
+
+
 class ListDocument(Document):
     """What there is of a kind, see `latticebench list` and `latticebench data`."""
 
@@ -219,7 +279,7 @@ class ListDocument(Document):
     rows: list[dict[str, JsonValue]]
 
 
-def fit_document(found: Fit, about: Provenance) -> FitDocument:
+def fit_document(found: Fit, quality: Adequacy, units: Units, about: Provenance) -> FitDocument:
     """Return the document of a fit."""
     texts = found.library.texts
     return FitDocument(
@@ -227,10 +287,14 @@ def fit_document(found: Fit, about: Provenance) -> FitDocument:
         coefficients=dict(zip(texts, map(float, found.coefficients), strict=True)),
         stderr=None if found.stderr is None else dict(zip(texts, map(float, found.stderr), strict=True)),
         residual=found.residual, seconds=found.seconds, status=found.status,
+        quality=Quality(work=quality.work, r2=quality.r2, times=quality.times, fits=quality.fits),
+        warnings=list(quality.warnings), units=units,
     )  # fmt: skip
 
 
-def limit_document(found: Limit, needed: Design, note: str, about: Provenance) -> LimitDocument:
+def limit_document(
+    found: Limit, needed: Design, note: str, about: Provenance, warnings: Sequence[str] = ()
+) -> LimitDocument:
     """Return the document of a bound; `note` says where it was taken."""
     texts = found.library.texts
     rows = zip(texts, found.coefficients, found.stderr, found.errors, found.verdicts, strict=True)
@@ -242,8 +306,15 @@ def limit_document(found: Limit, needed: Design, note: str, about: Provenance) -
             for text, value, stderr, error, verdict in rows
         },
         groups=[[texts[k] for k in group] for group in found.groups],
-        needed=Needed(**dataclasses.asdict(needed)),
+        needed=Needed(**dataclasses.asdict(needed)), warnings=list(warnings),
     )  # fmt: skip
+
+
+def inspection_document(found: Sequence[Inspection], units: Units, about: Provenance) -> InspectionDocument:
+    """Return the document of recordings."""
+    return InspectionDocument.model_validate(
+        {"provenance": about, "units": units, "trajectories": [dataclasses.asdict(one) for one in found]}
+    )
 
 
 def run_document(rows: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> RunDocument:

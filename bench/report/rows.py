@@ -7,6 +7,7 @@ import math
 from latticebench.bench.report.content import Report
 from latticebench.bench.report.horizons import Candidate
 from latticebench.bench.report.modes import Mode
+from latticebench.bench.report.units import with_unit
 
 Table = tuple[list[str], list[list[str]]]
 
@@ -27,7 +28,9 @@ def effects(report: Report) -> Table:
             for name, value in one.parameters.items()
             if name not in one.natural
         ]
-        numbers += [[name, f"{size.value:.5g}", _error(size.stderr)] for name, size in one.natural.items()]
+        numbers += [
+            [name, with_unit(f"{size.value:.5g}", size.unit), _error(size.stderr)] for name, size in one.natural.items()
+        ]
         rows += [[one.effect, *row] for row in numbers[:LISTED]]
         if len(numbers) > LISTED:
             rows.append([one.effect, f"... and {len(numbers) - LISTED} more, in the JSON", "", ""])
@@ -67,10 +70,13 @@ def errors(report: Report) -> Table:
             return "-"
         return f"{100 * value:.3g} %" if value < DIVERGED else "diverges"
 
-    error = report.error
+    error, unit = report.error, report.recording.units.reading or "the units of the readings"
     rows = [
         ["residual over the noise", *(f"{one:.3g}" for one in (error.residual.before, error.residual.after))],
-        ["residual in the units of the readings", *(f"{one:.3g}" for one in (error.rms.before, error.rms.after))],
+        [
+            f"residual in {unit}" if unit else "residual in the units of the readings",
+            *(f"{one:.3g}" for one in (error.rms.before, error.rms.after)),
+        ],
         ["share of the derivative that is left", share(error.dynamics.before), share(error.dynamics.after)],
         ["forecast error on held-out data", share(error.forecast.before), share(error.forecast.after)],
         [
@@ -89,7 +95,10 @@ def modes(report: Report) -> Table:
 
     Where the spectrum has no peaks, the modes of the last model are listed.
     """
-    columns = ["peak of the recording", "mode before", "mode after", "decay time before", "decay time after"]
+    unit = report.recording.units.time
+    time = f" ({unit})" if unit else ""
+    peak = f"peak of the recording{f' (1/{unit})' if unit else ''}"
+    columns = [peak, "mode before", "mode after", f"decay time before{time}", f"decay time after{time}"]
     every, rows = report.modes, []
     places = [one.frequency for one in every.recording] or [one.frequency for one in every.after]
     for place in places[:LISTED]:

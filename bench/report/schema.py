@@ -12,6 +12,7 @@ from latticebench.bench.report.document import Document
 from latticebench.bench.report.outputs import (
     CompareDocument,
     FitDocument,
+    InspectionDocument,
     LimitDocument,
     ListDocument,
     RunDocument,
@@ -20,7 +21,7 @@ from latticebench.bench.report.outputs import (
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 DOCUMENTS: dict[str, type[Document]] = {
     "fit": FitDocument, "limit": LimitDocument, "diagnosis": DiagnosisDocument, "run": RunDocument,
-    "compare": CompareDocument, "list": ListDocument,
+    "compare": CompareDocument, "list": ListDocument, "inspection": InspectionDocument,
 }  # fmt: skip
 
 

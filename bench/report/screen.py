@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
     from rich.text import Text as RichText
 
+    from latticebench.bench.adequacy import Adequacy
     from latticebench.bench.case import Case
     from latticebench.bench.limit import Design, Limit
     from latticebench.methods.method import Fit
@@ -58,8 +59,16 @@ def _text(value: Any) -> str:
     return str(value)
 
 
-def show_fit(fit: Fit) -> None:
-    """Print a fit: its coefficients, its equation, and what it leaves."""
+def show_warnings(warnings: Sequence[str]) -> None:
+    """Print what is wrong with a result, before it."""
+    for line in warnings:
+        console().print(f"Warning: {line}.", style="bold red", highlight=False, markup=False, soft_wrap=True)
+
+
+def show_fit(fit: Fit, quality: Adequacy | None = None, units: str = "") -> None:
+    """Print a fit: what is wrong with it, its coefficients, its equation, and what it leaves."""
+    if quality is not None:
+        show_warnings(quality.warnings)
     columns = ["term", "coefficient"]
     rows = [[text, f"{value:.6g}"] for text, value in zip(fit.library.texts, fit.coefficients, strict=True)]
     if fit.stderr is not None:
@@ -69,14 +78,22 @@ def show_fit(fit: Fit) -> None:
     left = (
         ""
         if fit.residual != fit.residual
-        else f"; {100 * fit.residual:.3g} % of the derivative is left, its noise included"
+        else f"; {100 * fit.residual:.3g} % of {'the readings' if fit.motion else 'the derivative'} is left, "
+        "its noise included"
     )
-    for line in (written(fit), f"{fit.method}: {fit.status}{left}; {fit.seconds:.2f} s"):
+    state = fit.status if quality is None or quality.fits or fit.status != "ok" else "does not fit"
+    lines = [written(fit), f"{fit.method}: {state}{left}; {fit.seconds:.2f} s"]
+    if units:
+        lines.append(f"units: {units}")
+    if quality is not None:
+        lines.append(quality.in_words)
+    for line in lines:
         console().print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
 
-def show_limit(limit: Limit, design: Design, note: str) -> None:
-    """Print a bound: each coefficient with its smallest error and a verdict, and what more accuracy would need."""
+def show_limit(limit: Limit, design: Design, note: str, warnings: Sequence[str] = ()) -> None:
+    """Print a bound: warnings, each coefficient with its smallest error and a verdict, and what more would need."""
+    show_warnings(warnings)
     columns = ["term", "coefficient", "smallest error", "verdict"]
     rows = zip(limit.library.texts, limit.coefficients, limit.stderr, limit.verdicts, strict=True)
     show_rows(columns, [[text, f"{value:.6g}", f"{error:.2g}", verdict] for text, value, error, verdict in rows])

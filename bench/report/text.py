@@ -5,6 +5,7 @@ from __future__ import annotations
 from latticebench.bench.report import rows
 from latticebench.bench.report.content import Report
 from latticebench.bench.report.screen import console, show_rows
+from latticebench.bench.report.units import in_words
 
 INTERRUPTED = "Interrupted: this is what was known after the last horizon."
 
@@ -47,6 +48,9 @@ def _show_equations(report: Report) -> None:
         _say(f"{name}: {equation.text}")
         for line in equation.elsewhere:
             _say(f"    {line}")
+    units = in_words(report.recording.units)
+    if units:
+        _say(f"units: {units}")
 
 
 def _show_search(report: Report) -> None:

@@ -94,7 +94,18 @@ def test_a_fit_prints_its_equation_and_writes_json_in_the_order_of_the_terms(fol
     assert "u'' = " in out
     assert "u[n]**3" in out
     written = json.loads((folder / "fit.json").read_text())
-    keys = ["method", "order", "coefficients", "stderr", "residual", "seconds", "status"]
+    keys = [
+        "method",
+        "order",
+        "coefficients",
+        "stderr",
+        "residual",
+        "seconds",
+        "status",
+        "quality",
+        "warnings",
+        "units",
+    ]
     assert list(written) == ["schema", "provenance", *keys]
     assert list(written["coefficients"]) == ["u[n+1]", "u[n-1]", "u[n]", "u[n]**3"]
     np.testing.assert_allclose(list(written["coefficients"].values()), [2, 2, -2, -2], rtol=0.02)
@@ -163,7 +174,7 @@ def test_the_limit_of_a_file_is_near_the_one_of_the_system_that_it_came_from(fol
     assert "noise of all sensors: 0.0" in shown
     assert "these bounds do not hold" not in shown
     poor = succeed("limit", "phi4.csv", "--ends", "free", "--order", 2, "--terms", "u[n+1]+u[n-1]-2*u[n]", cwd=folder)
-    assert "times the noise: these bounds do not hold; see `latticebench diagnose`" in " ".join(poor.split())
+    assert "times the noise: these bounds do not hold; see `latticebench diagnose`" in poor.splitlines()[0]
 
 
 @pytest.fixture(scope="module")
@@ -232,7 +243,8 @@ BAD_FILES = {
     "words.csv": ("\x00\x01\xff", "words.csv"),
     "gap.csv": ("t,u1,u3\n0,1,1\n1,1,1\n", "column u2 is missing"),
     "ragged.csv": ("t,u1\n0,1\n1,2,3,4\n", "not a table"),
-    "notes.txt": ("hello", "ending '.txt'"),
+    "notes.odt": ("hello", "ending '.odt'"),
+    "notes.txt": ("hello", "there is no column t"),
 }
 
 
@@ -284,7 +296,11 @@ BAD_COMMANDS = {
     "fit phi4.csv --system phi4 --library lib1 --method three.py": "METHODS",
     "fit phi4.csv --system phi4 --library lib1 --method bare.py": "has no 'abilities'",
     "fit phi4.csv --system phi4 --library lib1 --method raising.py": "ZeroDivisionError: division by zero",
-    "fit semicolons.csv --system phi4 --library lib1": "separate them by commas",
+    "fit lab.csv --system phi4 --library lib1": '--time time_s --columns "x*"',
+    "fit lab.csv --system phi4 --library lib1 --time zeit": "unknown column 'zeit'",
+    "diagnose lab.csv --system phi4 --time time_s --columns y*": "unknown column 'y*'",
+    "inspect lab.csv --time time_s --columns x* --scale furlong": "unknown scale 'furlong'",
+    "inspect lab.csv --time time_s --columns x* --out x.bmp": "'.bmp'",
     "fit still.csv --terms u[n] --order 2": "nothing moves",
     "fit huge.csv --terms u[n]**12 --order 2": "not finite",
     "fit short.csv --terms u[n] --order 2": "short.csv: a quintic spline needs at least 6 samples",
@@ -342,7 +358,7 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(command: str, folder: Path)
         "class Raising:\n    name = 'raising'\n    abilities = Abilities()\n\n"
         "    def fit(self, data, library, order, seed):\n        return 1 / 0\n\nMETHODS = (Raising,)\n"
     )
-    (folder / "semicolons.csv").write_text("t;u1;u2\n0;1;2\n1;2;3\n")
+    (folder / "lab.csv").write_text("time_s;x1;x2\n0;1;2\n1;2;3\n")
     (folder / "still.csv").write_text("t,u1\n" + "".join(f"{k},3.5\n" for k in range(20)))
     (folder / "huge.csv").write_text("t,u1\n" + "".join(f"{k},{(-1) ** k * 1e200}\n" for k in range(20)))
     (folder / "short.csv").write_text("t,u1\n" + "".join(f"{k},{k * k}\n" for k in range(4)))

@@ -15,6 +15,7 @@ import pydantic
 import pytest
 
 from latticebench.bench import cli
+from latticebench.bench.adequacy import Adequacy
 from latticebench.bench.case import Case
 from latticebench.bench.compare import compare, of_fits
 from latticebench.bench.fitting import FitCase
@@ -29,6 +30,7 @@ from latticebench.bench.report.outputs import (
     run_document,
 )
 from latticebench.bench.report.schema import DOCUMENTS, json_schema
+from latticebench.bench.report.units import units_of
 from latticebench.bench.tables import cases
 from latticebench.bench.trials import recorded, scores
 from latticebench.bench.trials.measured import Measured
@@ -36,6 +38,7 @@ from latticebench.bench.trials.trial import Trial
 from latticebench.bench.worker import outcome
 from latticebench.methods.method import Fit
 from latticebench.systems.lattice import library
+from latticebench.systems.samples import Origin
 
 Conforms = Callable[[str, str], dict[str, Any]]
 SCHEMAS = resources.files("latticebench.bench.report") / "schemas"
@@ -96,7 +99,8 @@ def test_numbers_that_json_lacks_have_one_rule() -> None:
 
 def test_a_document_of_another_version_is_refused() -> None:
     about = Provenance(command="", commit="", date="", machine="", versions={}, seeds=[])
-    text = to_json(fit_document(Fit("mine", library("own", "u[n]"), 2, np.ones(1), 0.5), about))
+    fit = Fit("mine", library("own", "u[n]"), 2, np.ones(1), 0.5)
+    text = to_json(fit_document(fit, Adequacy(0.5, 0.5, 1.0, fits=True), units_of(Origin()), about))
     with pytest.raises(pydantic.ValidationError):
         FitDocument.model_validate_json(text.replace("fit/1", "fit/2"))
 
@@ -117,6 +121,7 @@ def test_a_fit_and_a_limit_are_written_in_the_published_form(
     assert conforms("fit", (tmp_path / "fit.json").read_text())["coefficients"] == found["coefficients"]
     bound = conforms("limit", typed(monkeypatch, capsys, "limit", *system, "--sites", "9", "--json", "-"))
     assert list(bound["terms"]) == list(found["coefficients"])
+    assert (found["warnings"], found["quality"]["fits"], bound["warnings"]) == ([], True, [])
 
 
 def test_recordings_are_listed_in_the_published_form(

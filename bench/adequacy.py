@@ -1,0 +1,206 @@
+"""How well a fitted equation describes the recordings that it was fitted to, whatever method fitted it.
+
+From smoothed states, all over a recording, the equation is followed for half a period of its main frequency, to where
+the readings are known. What it misses there is compared with what a motion without forces misses (the share of the
+forces' work that is left), with the readings' variance (R^2), and with the noise that neighbouring readings show
+(`latticebench.diagnosis.instrument`). Integrals suffer far less from noise than derivatives do, so that even of noisy
+readings a right equation explains most. Where the method followed the motion itself, what is left of that is compared
+with the noise as well (`latticebench.bench.noise`). The truth of simulated samples takes no part.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.bench.noise import centred, left_by
+from latticebench.diagnosis.instrument import of_readings
+from latticebench.diagnosis.problem import Spectrum
+from latticebench.methods.engine.bsplines import BSplines
+from latticebench.methods.engine.derivatives import DEGREE
+from latticebench.methods.engine.dynamics import Dynamics, split_parts
+from latticebench.methods.engine.sensitivity import Stretches
+from latticebench.methods.engine.starts import smooth
+from latticebench.systems.samples import Samples, SimulatedSamples
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+    from latticebench.methods.method import Fit
+
+# An equation misfits where it leaves more than this share of the forces' work, and so many times the noise.
+SHARE, TIMES = 0.1, 2.5
+# Where the readings do not show their noise, it misfits beyond this share.
+WITHOUT_NOISE = 0.5
+# Places that it is followed from in each recording, at most, and the share of them that it meets worst: these are left
+# out, since smoothed states are poor at the ends of a recording.
+MOST, WORST = 40, 0.1
+# Tolerance of the integration, as a share of the readings' size.
+TOLERANCE = 1e-4
+# Beyond so many times the readings' size a motion has run away; how far does not matter.
+AWAY = 10.0
+TINY = np.finfo(float).tiny
+# Stretches that half a period is followed in, at most.
+HOPS = 16
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """How well an equation fits.
+
+    Attributes:
+        work: share of the forces' work over half a period that is left (root mean square, 0 to 1 and beyond).
+        r2: R^2 of the readings half a period ahead, 1 where they are met.
+        times: what is left in units of the noise of the readings; of the motion that the method followed, if it
+            followed one. NaN where the readings do not show their noise.
+        fits: whether the equation describes the readings.
+        warnings: what a user has to know, the most important first; empty where the equation fits.
+    """
+
+    work: float
+    r2: float
+    times: float
+    fits: bool
+    warnings: tuple[str, ...] = ()
+
+    def also(self, lines: tuple[str, ...]) -> Adequacy:
+        """Return the same with hints at a cause, where the equation does not fit."""
+        return self if self.fits else replace(self, warnings=(*self.warnings, *lines))
+
+    @property
+    def in_words(self) -> str:
+        """The numbers in one line."""
+        parts = []
+        if np.isfinite(self.work):
+            parts.append(f"half a period ahead it leaves {100 * self.work:.2g} % of what the forces do")
+        if np.isfinite(self.r2):
+            parts.append(f"R^2 = {self.r2:.4g}" if self.r2 > -1 else "R^2 < -1")
+        parts.append("the noise is not seen" if np.isnan(self.times) else f"{self.times:.2g} times the noise is left")
+        return "; ".join(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Sums of squares for each place of one recording: what the equation leaves, what forces do, and the readings'.
+
+    In `noise` what is left is in units of the noise, over the readings that show theirs, of which there are `told`.
+    """
+
+    left: Float[ndarray, " place"]
+    forces: Float[ndarray, " place"]
+    spread: Float[ndarray, " place"]
+    noise: Float[ndarray, " place"]
+    told: Float[ndarray, " place"]
+
+
+def adequacy(data: Sequence[Samples], fit: Fit) -> Adequacy:
+    """Return how well a fit describes recordings.
+
+    Raises:
+        InputError: the equation cannot be set up on them.
+    """
+    shown = [one.observed() if isinstance(one, SimulatedSamples) else one for one in data]
+    sums = [_followed(one, fit) for one in shown if len(one.t) > DEGREE]
+    if not sums:
+        return Adequacy(np.nan, np.nan, np.nan, fits=True)
+    place = {name: np.concatenate([getattr(one, name) for one in sums]) for name in vars(sums[0])}
+    best = np.argsort(place["left"])[: max(1, round((1 - WORST) * len(place["left"])))]
+    left, forces, spread, noise, told = (float(np.sum(one[best])) for one in place.values())
+    work = float(np.sqrt(left / forces)) if forces > 0 else np.nan
+    r2 = 1 - left / spread if spread > 0 else np.nan
+    times = float(np.sqrt(noise / told)) if told else np.nan
+    misfit = work > (WITHOUT_NOISE if np.isnan(times) else SHARE) and not times <= TIMES
+    if fit.motion is not None and fit.found.get("noise_u"):
+        by_motion = left_by(shown, fit)
+        times, misfit = by_motion.times, misfit or by_motion.misfit
+    return Adequacy(work, r2, times, not misfit, _warnings(fit, work, times) if misfit else ())
+
+
+def _followed(samples: Samples, fit: Fit) -> _Sums:
+    """Follow the equation over half a period from many places of one recording."""
+    from scipy.interpolate import make_interp_spline
+
+    dynamics = Dynamics(fit.library.terms, fit.order, samples.is_complex, samples.sites, samples.ends)
+    u, v = smooth(samples, fit.order)
+    states = dynamics.pack(u, v)
+    drive, splines = None, None
+    if len(dynamics.border):
+        # Sites without an equation move as they were read.
+        curve = make_interp_spline(samples.t, split_parts(u[:, dynamics.border], samples.is_complex), k=3)
+        drive, splines = BSplines(curve.t, 3), curve.c
+    inputs = samples.forcing() if fit.library.uses("f") else None
+    stretches = Stretches(dynamics, samples.t[:-1], samples.t[1:], inputs, drive, held=True)
+    t, ahead = samples.t, _ahead(samples)
+    begin = np.unique(np.linspace(0, len(t) - 1 - ahead, MOST).round().astype(int))
+    found = _integrated(stretches, samples.t, states, (begin, ahead), fit.coefficients, splines)
+    shape = (len(begin), dynamics.order, dynamics.parts, dynamics.count)
+    free = states[begin].reshape(shape)[:, 0].copy()
+    if dynamics.order == 2:
+        free += states[begin].reshape(shape)[:, 1] * (t[begin + ahead] - t[begin])[:, None, None]
+    seen = split_parts(samples.u, samples.is_complex)[..., dynamics.moving][begin + ahead]
+    known = np.isfinite(seen)
+    middle = np.nanmean(split_parts(samples.u, samples.is_complex)[..., dynamics.moving], axis=0)
+    away = AWAY * float(np.nanmax(np.abs(seen - middle), initial=0.0))
+    wrong = np.nan_to_num(found.reshape(shape)[:, 0] - seen, nan=away, posinf=away, neginf=away)
+    wrong = np.where(known, np.clip(wrong, -away, away), 0.0)
+    noise = of_readings(t, centred(samples.u))[dynamics.moving]
+    told = known & np.isfinite(noise) & (noise > 0)
+    parts = [
+        wrong**2, np.nan_to_num(free - seen) ** 2, np.nan_to_num(seen - middle) ** 2,
+        np.where(told, wrong / np.where(noise > 0, noise, 1.0), 0.0) ** 2, told,
+    ]  # fmt: skip
+    return _Sums(*(np.sum(one, axis=(1, 2), dtype=float) for one in parts))
+
+
+def _integrated(
+    stretches: Stretches,
+    t: ndarray,
+    states: ndarray,
+    places: tuple[ndarray, int],
+    coefficients: ndarray,
+    splines: ndarray | None,
+) -> Float[ndarray, "place state"]:
+    """Return the states so many samples after those at `begin`; infinite where they have run away."""
+    begin, ahead = places
+    levels = states.reshape(len(states), stretches.dynamics.order, -1)
+    # That of u and of v: some sites hardly move.
+    size = np.broadcast_to(np.max(np.std(levels, axis=0), axis=1)[:, None] + TINY, levels.shape[1:]).ravel()
+    far = AWAY * np.max(np.abs(states))
+    found = states[begin].copy()
+    near = np.arange(len(begin))
+    # In short stretches, since one that is unbounded in a single step is given up.
+    for one, other in itertools.pairwise(np.unique(np.linspace(0, ahead, HOPS + 1).round().astype(int))):
+        hop = replace(stretches, begin=t[begin[near] + one], end=t[begin[near] + other])
+        with np.errstate(all="ignore"):
+            substeps = hop.substeps(coefficients, found[near], TOLERANCE * size, splines)
+            found[near] = hop.run(coefficients, found[near], substeps, splines)
+            away = ~np.all(np.abs(found[near]) < far, axis=1)
+        found[near[away]] = np.inf
+        near = near[~away]
+        if not len(near):
+            break
+    return np.asarray(found)
+
+
+def _ahead(samples: Samples) -> int:
+    """Return how many samples half a period of the strongest line is long."""
+    peaks = Spectrum.of(samples).peaks
+    step = float(np.median(np.diff(samples.t)))
+    half = np.pi / float(peaks[0]) / step if len(peaks) and peaks[0] > 0 else len(samples.t) / 10
+    return int(np.clip(round(half), 1, max(len(samples.t) // 3, 1)))
+
+
+def _warnings(fit: Fit, work: float, times: float) -> tuple[str, ...]:
+    beyond = "" if np.isnan(times) else f", {times:.2g} times the noise of the readings"
+    lines = [
+        f"the equation does not fit: over half a period it leaves {100 * min(work, AWAY):.2g} % of what the forces do"
+        f"{beyond}; `latticebench diagnose` looks for what it lacks"
+    ]
+    if fit.stderr is not None:
+        lines.append("standard errors hold for a right equation only; here they mean nothing")
+    return tuple(lines)

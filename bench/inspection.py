@@ -1,0 +1,181 @@
+"""What a recording is like before any equation: sites, sampling, gaps, ranges, noise, frequencies, suspicious things.
+
+Readings, noise and steps are in the units of the file, times and frequencies in that of its times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.bench.noise import centred
+from latticebench.bench.report.notes import strays
+from latticebench.diagnosis.instrument import of_readings, step_of
+from latticebench.diagnosis.problem import Spectrum
+from latticebench.methods.engine.dynamics import split_parts
+from latticebench.systems.lattice import Library
+from latticebench.systems.samples import Samples
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+# An argument of a sine beyond this is hardly an angle in radians, unless something turns over and over.
+ANGLE = 10.0
+PERIODIC = ("sin", "cos", "tan")
+# A step between readings this many times the usual one is a gap.
+GAP = 2.5
+# Readings at the very end of a range are clipped where there are so many, and so many times those at the next level.
+CLIPPED, CROWDED = 5, 4
+# A share of the noise's variance that makes rounding worth a word.
+ROUNDED = 0.5
+# Readings in a period, and periods in a record, below which little can be told.
+SPARSE, SHORT = 5.0, 3.0
+PEAKS = 5
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The readings of one sensor; of a complex field, of its real and imaginary part together.
+
+    Attributes:
+        name: the column in the file.
+        readings, missing: how many there are, and how many are missing.
+        least, most: the range.
+        noise: standard deviation; NaN where neighbouring readings do not show it.
+        step: of the converter; 0 where none is seen.
+    """
+
+    name: str
+    readings: int
+    missing: int
+    least: float
+    most: float
+    noise: float
+    step: float
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What one trajectory is like.
+
+    Attributes:
+        source: where it comes from.
+        sites, rows: how many there are.
+        begin, end, interval: the first and the last time, and the usual step between times.
+        uneven: whether steps differ from it by more than a thousandth.
+        gaps: begin and end of the longest steps beyond `GAP` times the usual one, the longest first.
+        seen: what was read beside u: "v", "f".
+        sensors: of u.
+        frequencies: of the strongest lines, in cycles per unit of time.
+        suspicious: what deserves a look.
+        notes: how the file was read.
+    """
+
+    source: str
+    sites: int
+    rows: int
+    begin: float
+    end: float
+    interval: float
+    uneven: bool
+    gaps: tuple[tuple[float, float], ...]
+    seen: tuple[str, ...]
+    sensors: tuple[Sensor, ...]
+    frequencies: tuple[float, ...]
+    suspicious: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def inspect(samples: Samples, terms: Library | None = None) -> Inspection:
+    """Return what a recording is like; with terms, also whether it makes sense in them."""
+    t = samples.t
+    steps = np.diff(t)
+    usual = float(np.median(steps))
+    wide = np.argsort(-steps, kind="stable")
+    gaps = tuple((float(t[k]), float(t[k + 1])) for k in wide[:PEAKS] if steps[k] > GAP * usual)
+    peaks = Spectrum.of(samples).peaks[:PEAKS] / (2 * np.pi)
+    sensors = tuple(_sensors(samples))
+    return Inspection(
+        samples.source, samples.sites, len(t), float(t[0]), float(t[-1]), usual, not samples.is_even, gaps,
+        tuple(name for name in ("v", "f") if getattr(samples, name) is not None), sensors, tuple(map(float, peaks)),
+        tuple(_suspicious(samples, sensors, list(map(float, peaks)), terms)), samples.origin.notes,
+    )  # fmt: skip
+
+
+def _sensors(samples: Samples) -> Iterator[Sensor]:
+    """Yield what is known of each sensor."""
+    origin, size = samples.origin, abs(samples.origin.scale)
+    noise = of_readings(samples.t, centred(samples.u)) / size
+    for site in range(samples.sites):
+        field = samples.u[:, site]
+        missing = int(np.sum(np.isnan(field)))
+        values = _values(field) / origin.scale
+        name = origin.columns[site] if origin.columns else f"{'re' if samples.is_complex else 'u'}{site + 1}"
+        if not len(values):
+            yield Sensor(name, 0, missing, np.nan, np.nan, np.nan, 0.0)
+            continue
+        step = step_of(values - np.mean(values))
+        yield Sensor(
+            name, len(field) - missing, missing, float(values.min()), float(values.max()), float(noise[site]), step
+        )
+
+
+def _values(field: ndarray) -> ndarray:
+    """Return the readings of a sensor that are there, as real numbers."""
+    values = split_parts(field[:, None], np.iscomplexobj(field)).ravel()
+    return np.asarray(values[np.isfinite(values)])
+
+
+def _suspicious(
+    samples: Samples, sensors: Sequence[Sensor], peaks: Sequence[float], terms: Library | None
+) -> Iterator[str]:
+    """Yield what deserves a look, one sentence each."""
+    yield from _of_terms(samples, terms)
+    for site, one in enumerate(sensors):
+        values = _values(samples.u[:, site])
+        if one.readings == 0:
+            yield f"{one.name}: nothing was read"
+        elif np.ptp(values) == 0:
+            yield f"{one.name}: always {one.most:g}; does this sensor work?"
+        else:
+            yield from _at_ends(one, values / samples.origin.scale)
+            if one.noise > 0 and one.step**2 / 12 > ROUNDED * one.noise**2:
+                yield f"{one.name}: readings come in steps of {one.step:.3g}; rounding makes most of the noise"
+        for other in range(site):
+            if one.readings and np.array_equal(samples.u[:, site], samples.u[:, other], equal_nan=True):
+                yield f"{one.name}: the same readings as {sensors[other].name}; is one a copy of the other?"
+    yield from strays(samples)
+    span, usual = float(np.ptp(samples.t)), float(np.median(np.diff(samples.t)))
+    if len(peaks):
+        if 1 / max(peaks) < SPARSE * usual:
+            yield f"{1 / max(peaks) / usual:.2g} readings in a period of the fastest line; {SPARSE:g} are few"
+        if span * min(peaks) < SHORT:
+            yield f"{span * min(peaks):.2g} periods of the slowest line; {SHORT:g} or more tell damping from noise"
+
+
+def _at_ends(one: Sensor, values: ndarray) -> Iterator[str]:
+    """Yield where readings crowd at an end of the range."""
+    levels, counts = np.unique(values, return_counts=True)
+    for level, count, beside, end in ((levels[-1], counts[-1], counts[-2], "above"), (levels[0], *counts[:2], "below")):
+        if count >= CLIPPED and count > CROWDED * beside:
+            yield f"{one.name}: {count} readings of just {level:g} and none {end}; are they clipped?"
+
+
+def _of_terms(samples: Samples, terms: Library | None) -> Iterator[str]:
+    """Yield where readings make no sense in the terms."""
+    if terms is None or not any(terms.uses(name) for name in PERIODIC):
+        return
+    largest = float(np.nanmax(np.abs(samples.u)))
+    if largest > ANGLE:
+        name, unit = next(one for one in PERIODIC if terms.uses(one)), samples.origin.unit
+        known = unit in ("deg", "arcmin")
+        remedy = f"read the angles with --scale {unit}" if known else "if these are degrees: --scale deg"
+        yield f"u reaches {largest:.3g} in {name}(...), which takes radians; {remedy}"
+
+
+def sine_warning(data: Sequence[Samples], terms: Library) -> tuple[str, ...]:
+    """Return what is to be said of readings too large for the sines of an equation."""
+    return tuple(dict.fromkeys(line for one in data for line in _of_terms(one, terms)))

@@ -1,0 +1,94 @@
+"""Units of a recording, as its file tells them, in what is said of it.
+
+Readings are shown in the unit of the file, coefficients in that of the equation: u = scale * reading.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from latticebench.bench.report.document import Content, Number
+from latticebench.diagnosis.instrument import describe
+
+if TYPE_CHECKING:
+    from latticebench.diagnosis.noise import Noise
+    from latticebench.systems.samples import Origin
+
+# Digits of a number within a sentence.
+DIGITS = 4
+
+
+class Units(Content):
+    """The units of a recording; "" where one is not known.
+
+    Attributes:
+        time: of times.
+        reading: of what was read.
+        equation: of u in the equation.
+        scale: what one unit of a reading is in the equation.
+    """
+
+    time: str
+    reading: str
+    equation: str
+    scale: Number
+
+
+def units_of(origin: Origin) -> Units:
+    """Return the units of a recording."""
+    return Units(time=origin.time, reading=origin.unit, equation=origin.becomes, scale=origin.scale)
+
+
+def in_words(units: Units) -> str:
+    """Return the units in one line; "" where nothing is known of them."""
+    parts = [f"t in {units.time}"] if units.time else []
+    if units.equation:
+        parts.append(f"u in {units.equation}")
+    if units.reading and units.reading != units.equation:
+        parts.append(f"readings in {units.reading}")
+    if units.scale != 1 and not units.equation:
+        parts.append(f"u is {units.scale:g} times the reading")
+    return "; ".join(parts)
+
+
+def with_unit(value: str, unit: str) -> str:
+    """Return a number with its unit."""
+    return f"{value} {unit}".rstrip()
+
+
+def of_natural(name: str, units: Units) -> tuple[float, str]:
+    """Return the factor and the unit of an effect's number in its natural form, by its name."""
+    if name.startswith("offset of "):
+        return 1 / units.scale, units.reading
+    return 1.0, units.time if name.endswith("time") else ""
+
+
+def in_sentence(line: str, units: Units) -> str:
+    """Return a sentence about an effect with its offset, or its time, in the units of the recording."""
+    offset = re.fullmatch(r"(offset of \w+): (\S+)", line)
+    if offset:
+        return f"{offset[1]}: {with_unit(f'{float(offset[2]) / units.scale:.{DIGITS}g}', units.reading)}"
+    return with_unit(line, units.time) if re.search(r" within [\d.e+-]+$", line) else line
+
+
+def noise_in_words(noise: Noise, steps: Sequence[float], interval: float, sites: int, units: Units) -> list[str]:
+    """Return the noise of each sensor in words, in the unit of its readings; see `diagnosis.instrument.describe`.
+
+    Args:
+        noise: in units of the equation.
+        steps: of the sensors' converters, in the same.
+        interval: time from one reading to the next.
+        sites: sensors of u, after which those of v come.
+        units: of the recording.
+    """
+    lines: list[str] = []
+    for begin in range(0, len(noise.size), sites):
+        own = slice(begin, begin + sites)
+        part = replace(noise, size=noise.size[own] / abs(units.scale), memory=noise.memory[own])
+        unit = units.reading if begin == 0 else f"{units.reading}/{units.time}" if units.reading and units.time else ""
+        grid = [step / abs(units.scale) for step in steps[own]]
+        lines += [("velocity, " if begin else "") + line for line in describe(part, grid, unit, interval=interval)]
+    return lines
