@@ -1,35 +1,65 @@
 """Find the equations of motion of nonlinear lattices from data, and measure how well each method does it.
 
-Four rooms, each loaded when it is first used and importing only from those above it in this list:
+For notebooks, each loaded when it is first used (`latticebench.front`):
+
+- `read` a recording, `Model` an equation or take that of a `system`;
+- `fit` its coefficients, `diagnose` what it lacks, know the `limit` of what can be known;
+- `run` a suite of the benchmark, look at published `results`.
+
+Four rooms, each importing only from those above it in this list:
 
 - `latticebench.systems`: what is studied - terms, lattices, samples, simulation;
 - `latticebench.methods`: how an equation is found - the protocol, and one file per method;
 - `latticebench.diagnosis`: what a declared equation lacks;
 - `latticebench.bench`: how methods are compared - suites, runner, scores, tables, figures, command line.
+
+Names with a leading underscore, and those of the rooms that are not described in CONTRIBUTING.md, may change.
 """
 
 from __future__ import annotations
 
 import importlib
-from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from latticebench.front import (
+        Bound,
+        Cause,
+        Fitted,
+        Model,
+        Recording,
+        Run,
+        diagnose,
+        fit,
+        limit,
+        read,
+        results,
+        run,
+        system,
+    )  # fmt: skip
 
 ROOMS = ("systems", "methods", "diagnosis", "bench")
 
-__all__ = ["__version__", *ROOMS]
+__all__ = [
+    "Bound", "Cause", "Fitted", "Model", "Recording", "Run", "__version__", "bench", "diagnose", "diagnosis", "fit",
+    "limit", "methods", "read", "results", "run", "system", "systems",
+]  # fmt: skip
 
 
-def __getattr__(name: str) -> ModuleType | str:
-    """Import a room, or look the installed version up, when it is first asked for.
+def __getattr__(name: str) -> Any:
+    """Import a room or what a notebook uses, or look the installed version up, when it is first asked for.
 
     Raises:
         AttributeError: there is no such name.
     """
-    if name in ROOMS:
-        return importlib.import_module(f"{__name__}.{name}")
     if name == "__version__":
         from importlib.metadata import version
 
         return version("latticebench")
+    if name in ROOMS:
+        return importlib.import_module(f"{__name__}.{name}")
+    if name in __all__:
+        return getattr(importlib.import_module(f"{__name__}.front"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

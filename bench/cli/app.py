@@ -20,6 +20,7 @@ import latticebench
 from latticebench.bench.cli import (
     compare,
     data,
+    demo,
     diagnose,
     figures,
     fit,
@@ -75,6 +76,7 @@ app.command(epilog=simulate.EPILOG)(simulate.simulate)
 app.command(epilog=inspect.EPILOG)(inspect.inspect)
 app.command(epilog=fit.EPILOG)(fit.fit)
 app.command(epilog=diagnose.EPILOG)(diagnose.diagnose)
+app.command(epilog=demo.EPILOG)(demo.demo)
 app.add_typer(data.app, name="data")
 app.command(epilog=run.EPILOG)(run.run)
 app.command(epilog=table.EPILOG)(table.table)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,11 +16,9 @@ from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, layout_of
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
+    from latticebench.bench.bounds import BoundAt
     from latticebench.bench.fitting import FitCase
     from latticebench.bench.limit import Limit
-    from latticebench.methods.method import Fit
-    from latticebench.systems.lattice import Library
-    from latticebench.systems.samples import Samples
 
 EPILOG = (
     "Examples:  latticebench limit --system phi4 --set C=2 --library lib4 --noise 0.01\n\n"
@@ -71,6 +68,9 @@ def limit(
     Options from --set to --initial are about samples of a system; of recorded ones everything is known but their
     noise, which is what a fit leaves at each sensor.
     """
+    from latticebench.bench.bounds import of_recordings
+    from latticebench.bench.report.screen import waiting
+
     check_places([*(files or ()), system], json=json_out)
     known, candidates, order = asked(system, library, terms, order)
     simulated = {
@@ -82,7 +82,14 @@ def limit(
     if files:
         for name in described:
             raise InputError(f"--{name}: files are given, whose samples are as they are; leave it out, or the files")
-        note, bound_at, warnings = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
+        data = read_told(files, ends or "unknown", layout)
+        with (
+            told(data, None, "the fit"),
+            waiting(f"fitting {len(candidates.terms)} terms"),
+            redirect_stdout(sys.stderr),
+        ):
+            found = of_recordings(data, candidates, order)
+        note, bound_at, warnings = found.note, found.at, found.warnings
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
     else:
@@ -95,42 +102,6 @@ def limit(
         note, bound_at = _of_simulated(case, None if yes else case.sites or known.sites)
         warnings = ()
     _report(note, bound_at, target, json_out, warnings)
-
-
-# A bound for so many times the samples in the same time, and for a record so many times as long.
-BoundAt = Callable[[int, int], "Limit"]
-
-
-def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> tuple[str, BoundAt, tuple[str, ...]]:
-    """Return where the bound of recorded samples is taken, the bound, and why it may not hold."""
-    from latticebench.bench.limit import denser
-    from latticebench.bench.noise import left_by
-    from latticebench.bench.report.screen import waiting
-
-    with waiting(f"fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
-        fit = _followed(data, candidates, order)
-    left = left_by(data, fit)
-
-    def bound_at(more: int, longer: int) -> Limit:
-        if longer > 1:
-            raise InputError("nobody knows how the motion goes on after the record")
-        return denser(data, fit, more, left.noise)
-
-    note = (
-        f"{data[0].source}: bound along the motion that {fit.method!r} fits to the samples, with the noise that it "
-        "leaves" + ("" if fit.status == "ok" else f" ({fit.status})")
-    )
-    return "\n".join([note, *(f"noise of {line}" for line in left.lines)]), bound_at, left.warning
-
-
-def _followed(data: Sequence[Samples], candidates: Library, order: int) -> Fit:
-    """Fit by the method that gives the motion it follows."""
-    from latticebench import methods
-    from latticebench.methods.method import solve
-
-    method = next(kind() for kind in methods.registered().values() if kind().abilities.motion)
-    with told(data, None, "the fit"):
-        return solve(method, data, candidates, order, 1)
 
 
 def _of_simulated(case: FitCase, sites: int | None) -> tuple[str, BoundAt]:

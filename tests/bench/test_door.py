@@ -1,0 +1,131 @@
+"""A recording as it comes from a laboratory goes through the commands unedited."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from latticebench.bench.cli import main
+
+READING = ["--time", "time_s", "--columns", "theta_*_deg", "--scale", "deg"]
+MODEL = ["--terms", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])", "--order", "2", "--ends", "free"]
+OFFSETS = np.array([1.9, 1.8, -0.2, -1.2, -1.3, -1.5, -0.3])
+
+
+class Typed:
+    """Commands that are typed in a folder, within this process."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self.monkeypatch, self.capsys = monkeypatch, capsys
+
+    def __call__(self, *words: str, code: int = 0) -> tuple[str, str]:
+        self.monkeypatch.setattr(sys, "argv", ["latticebench", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+        told = self.capsys.readouterr()
+        assert (end.value.code or 0) == code, told.err
+        return told.out, told.err
+
+
+@pytest.fixture
+def typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Typed:
+    monkeypatch.chdir(tmp_path)
+    write_pendula(tmp_path / "pendula.csv")
+    return Typed(monkeypatch, capsys)
+
+
+def write_pendula(path: Path, step: float = 0.025) -> None:
+    """Seven damped pendula whose fifth is longer, all sensors off, in a file as an instrument's program writes it."""
+    draw = np.random.default_rng(7)
+    squares = np.where(np.arange(7) == 4, 22.0, 25.0)
+
+    def rate(_: float, y: np.ndarray) -> list[float]:
+        forces = []
+        for n in range(7):
+            pulls = sum(y[m] - y[n] for m in (n - 1, n + 1) if 0 <= m < 7)
+            forces.append(4.0 * pulls - squares[n] * np.sin(y[n]) - 0.06 * y[7 + n])
+        return [*y[7:], *forces]
+
+    start = np.concatenate([np.deg2rad(draw.uniform(-35, 35, 7)), np.zeros(7)])
+    t = np.arange(0, 20, step)
+    angles = np.rad2deg(solve_ivp(rate, (0, 20), start, t_eval=t, rtol=1e-9, atol=1e-11).y[:7].T)
+    angles += OFFSETS + 0.1 * draw.standard_normal(angles.shape)
+    head = ["Torsion chain, lab 3;;", "", "time_s;" + ";".join(f"theta_{k}_deg" for k in range(1, 8)) + ";temperature"]
+    rows = [
+        ";".join([f"{one:.3f}", *(f"{angle:.2f}" for angle in row), "21.04"]).replace(".", ",")
+        for one, row in zip(t, angles, strict=True)
+    ]
+    path.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8-sig")
+
+
+def test_the_refusal_names_the_options_that_read_the_file(typed: Typed) -> None:
+    _, told = typed("inspect", "pendula.csv", code=2)
+    assert 'read it with --time time_s --columns "theta_*_deg" --scale deg' in told
+
+
+def test_inspect_shows_columns_units_noise_and_frequencies_and_draws_them(typed: Typed, tmp_path: Path) -> None:
+    shown, _ = typed("inspect", "pendula.csv", *READING, "--out", "p.png", "--json", "p.json")
+    for word in ("theta_5_deg", "Nothing suspicious", "every 0.025 s", "(deg)", "not read: temperature", "1 row(s)"):
+        assert word in shown, shown
+    (found,) = json.loads((tmp_path / "p.json").read_text())["trajectories"]
+    np.testing.assert_allclose([one["noise"] for one in found["sensors"]], 0.1, rtol=0.35)
+    # Free pendula of this length swing with sqrt(25) / 2 pi.
+    assert any(abs(one - 0.8) < 0.05 for one in found["frequencies"])
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_inspect_points_at_degrees_clipped_and_resting_sensors(typed: Typed, tmp_path: Path) -> None:
+    t = np.arange(0, 20, 0.05)
+    wave = 40 * np.sin(3 * t) * np.exp(-0.01 * t) + 0.1 * np.random.default_rng(1).standard_normal(len(t))
+    table = np.column_stack([t, wave, np.clip(wave, -30, 30), np.full(len(t), 1.5), wave])
+    head = "t,u1,u2,u3,u4"
+    np.savetxt(tmp_path / "odd.csv", np.delete(table, slice(100, 110), axis=0), "%.4f", ",", header=head, comments="")
+    shown, _ = typed("inspect", "odd.csv", "--terms", "sin(u[n])")
+    for word in (
+        "u2: ", "of just 30 and none above", "of just -30 and none below", "u3: always 1.5", "--scale deg",
+        "u4: the same readings as u1", "gap from t = 4.95 to 5.5",
+    ):  # fmt: skip
+        assert word in shown, shown
+    assert "u1: " not in shown
+
+
+def test_a_fit_of_degrees_warns_in_its_first_line_and_in_json(typed: Typed) -> None:
+    words = ["fit", "pendula.csv", *READING[:4], *MODEL, "--method", "least-squares"]
+    shown, _ = typed(*words)
+    assert shown.startswith("Warning: the equation does not fit")
+    assert "least-squares: ok" not in shown
+    found = json.loads(typed(*words, "--json", "-")[0])
+    assert found["quality"]["fits"] is False
+    assert any("--scale deg" in line for line in found["warnings"])
+    assert found["units"] == {"time": "s", "reading": "deg", "equation": "deg", "scale": 1}
+
+
+@pytest.mark.slow
+def test_offsets_defect_and_damping_are_named_in_degrees_from_the_unedited_file(typed: Typed, tmp_path: Path) -> None:
+    shown, _ = typed("diagnose", "pendula.csv", *READING, *MODEL, "--json", "d.json")
+    found = json.loads((tmp_path / "d.json").read_text())
+    effects = {one["effect"]: one for one in found["effects"]}
+    assert found["verdict"] == "explained"
+    assert set(effects) == {"sensor-offset", "defect", "damping"}
+    for site, true in enumerate(OFFSETS, 1):
+        size = effects["sensor-offset"]["natural"][f"offset of u{site}"]
+        assert size["unit"] == "deg"
+        assert size["value"] == pytest.approx(true, abs=0.05)
+    assert effects["defect"]["parameters"]["site"] == 5
+    decay = effects["damping"]["natural"]["decay time"]
+    assert (decay["value"], decay["unit"]) == (pytest.approx(2 / 0.06, rel=0.05), "s")
+    np.testing.assert_allclose(list(found["noise"].values()), 0.1, rtol=0.1)
+    assert "deg" in shown.split("Equation")[0]
+
+
+@pytest.mark.slow
+def test_the_demo_finds_what_it_put_in(typed: Typed, tmp_path: Path) -> None:
+    shown, _ = typed("demo", "--out", "tried")
+    for word in ("site 5 alone", "damping", "offset of u3: 2", "tried/diagnosis.html"):
+        assert word in shown, shown
+    assert "<svg" in (tmp_path / "tried" / "diagnosis.html").read_text(encoding="utf-8")
