@@ -62,7 +62,9 @@ class Apart(Case):
     def run(self, folders: Folders, found: dict[str, Any]) -> None:
         """Read the samples and fit them; see `Case.run`."""
         method = make(methods.find(self.method, folders.suite), self.settings, texts=True)
-        fit = solve(method, read_all(self.files, self.ends, self.layout), library("terms", self.terms), self.order, self.seed)
+        fit = solve(
+            method, read_all(self.files, self.ends, self.layout), library("terms", self.terms), self.order, self.seed
+        )
         found.update(name=fit.method, note=fit.status, coefficients=fit.coefficients.tolist())
         found["stderr"] = None if fit.stderr is None else [plain(one) for one in fit.stderr]
         found.update({name: plain(getattr(fit, name)) for name in NUMBERS})
