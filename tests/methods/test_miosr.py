@@ -41,5 +41,5 @@ def test_without_its_solver_it_is_skipped_with_what_to_install(monkeypatch: pyte
 
 
 def test_a_setting_out_of_range_is_refused() -> None:
-    with pytest.raises(InputError, match="setting patience = 0.0: it must be above 0"):
+    with pytest.raises(InputError, match=r"setting patience = 0\.0: it must be above 0"):
         make(methods.find("miosr"), {"patience": 0.0})
