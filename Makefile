@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: bench test test-slow speed lint types wheel clean
+.PHONY: bench test test-slow speed lint types wheel docs clean
 
 bench: $(READY)
 	$(BIN)/latticebench run default --results runs/default
@@ -32,6 +32,14 @@ types: $(READY)
 wheel: $(READY)
 	rm -rf dist build
 	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
+
+# The pages of docs/, under build/docs; their commands and examples are run, and a warning is an error.
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx -W --keep-going -q -E -b html docs build/docs
+
+$(VENV)/.docs: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.txt --no-build-isolation -e ".[docs]"
+	@touch $(VENV)/.docs
 
 $(READY): requirements.txt pyproject.toml
 	$(PYTHON) -m venv $(VENV)

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.colours import SERIES, series
 from latticebench.bench.escape import label
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.provenance import lines
 from latticebench.bench.tables import cases, named, summary
-from latticebench.systems.files import whole
+from latticebench.systems.errors import unknown
+from latticebench.systems.files import shown, whole
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 FIGURES = ("coefficients", "errors", "error-against-seconds", "error-against-noise", "cost")
-COLOURS = ("tab:blue", "tab:red", "tab:green", "goldenrod", "tab:purple", "tab:cyan", "tab:brown", "tab:pink")
+# Endings of figures, and what the provenance and the program are called in such a file.
+IMAGES = {".png": ("Description", "Software"), ".svg": ("Description", "Creator"), ".pdf": ("Subject", "Creator")}
 MARKERS = "os^Dv<>Ph*Xp"
 BOUND = "Cramer-Rao bound, all terms kept"
 # Errors of round-off size share the lowest place of an axis.
@@ -140,7 +143,7 @@ def panel(group: Sequence[Mapping[str, Any]]) -> Figure:
 
 def _colours(terms: Sequence[str], truth: Mapping[str, float] | None) -> dict[str, str]:
     """Return a colour per term: one of its own where the term is in the equation, else black."""
-    colours = iter(COLOURS)
+    colours = iter(SERIES)
     return {term: "black" if truth is not None and truth[term] == 0 else next(colours, "tab:gray") for term in terms}
 
 
@@ -162,7 +165,7 @@ def errors(table: pd.DataFrame) -> Figure:
             _bounded(chosen["e2"]),
             places,
             MARKERS[k % len(MARKERS)],
-            color=f"C{k % 10}",
+            color=series(k),
             label=method,
             ms=6,
             alpha=0.85,
@@ -184,7 +187,7 @@ def error_against_seconds(table: pd.DataFrame) -> Figure:
         chosen = good[good["method"] == method]
         axes.plot(
             np.maximum(chosen["cpu_seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)],
-            color=f"C{k % 10}",
+            color=series(k),
             label=method, ms=6, alpha=0.75,
         )  # fmt: skip
     axes.set_xscale("log")
@@ -218,7 +221,7 @@ def cost(table: pd.DataFrame) -> Figure:
             chosen = good[here & (good["method"] == method)]
             axes.plot(
                 np.maximum(chosen["cpu_seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)],
-            color=f"C{k % 10}",
+            color=series(k),
                 ms=5, alpha=0.75, label=method,
             )  # fmt: skip
         axes.set_xscale("log")
@@ -308,7 +311,7 @@ def _noise_curves(axes: Axes, here: pd.DataFrame, methods: Sequence[str], apart:
         if middle.empty:
             continue
         at = middle.index * 10 ** (apart * (k - (len(methods) - 1) / 2))
-        colour = f"C{k % 10}"
+        colour = series(k)
         axes.vlines(at, _bounded(low), np.minimum(high, HIGHEST), color=colour, alpha=0.35, lw=2.2)
         style = f"-{MARKERS[k % len(MARKERS)]}"
         (drawn[method],) = axes.plot(at, _bounded(middle), style, color=colour, label=method, ms=3.5, lw=0.9)
@@ -350,16 +353,17 @@ def _axes(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 def save(figure: Figure, path: Path, about: Mapping[str, Any]) -> Path:
-    """Write a figure with its provenance, and close it.
+    """Write a figure with its provenance, as PNG, SVG or PDF by its ending, and close it.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: the file cannot be written, or it has another ending.
     """
     import matplotlib.pyplot as plt
 
+    if path.suffix.lower() not in IMAGES:
+        raise unknown("ending", path.suffix, IMAGES, shown(path))
+    key, maker = IMAGES[path.suffix.lower()]
     with whole(path) as temporary:
-        figure.savefig(
-            temporary, dpi=140, metadata={"Description": "\n".join(lines(about)), "Software": "latticebench"}
-        )
+        figure.savefig(temporary, dpi=140, metadata={key: "\n".join(lines(about)), maker: "latticebench"})
     plt.close(figure)
     return path

@@ -27,6 +27,7 @@ from latticebench.bench.cli import (
     inspect,
     limit,
     listing,
+    plot,
     run,
     schema,
     simulate,
@@ -83,6 +84,7 @@ app.command(epilog=table.EPILOG)(table.table)
 app.command(epilog=figures.EPILOG)(figures.figures)
 app.command(epilog=compare.EPILOG)(compare.compare)
 app.command(epilog=limit.EPILOG)(limit.limit)
+app.command(epilog=plot.EPILOG)(plot.plot)
 app.command(epilog=schema.EPILOG)(schema.schema)
 
 

@@ -138,13 +138,14 @@ def _report(found: Diagnosis, json_out: str | None, html_out: Path | None, *, in
     Raises:
         InputError: a file cannot be written; the others are, and the screen has it all.
     """
+    from latticebench.bench.overlay import of_diagnosis
     from latticebench.bench.report.content import content, diagnosis_document
     from latticebench.bench.report.document import provenance, to_json
     from latticebench.bench.report.text import show
     from latticebench.systems.files import write_text
 
     report, about = content(found, interrupted=interrupted), provenance()
-    text = "" if json_out is None else to_json(diagnosis_document(report, about))
+    text = "" if json_out is None else to_json(diagnosis_document(report, about, of_diagnosis(found)))
     failures: list[str] = []
     # Files first: whoever reads the screen may stop reading.
     if json_out is not None and json_out != "-":

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from latticebench.bench.cli.options import place
+from latticebench.systems.errors import InputError, unknown
+
+if TYPE_CHECKING:
+    from latticebench.bench.store import Store
+
+# Endings of files with which no folder is meant.
+ENDINGS = (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".gif")
 
 EPILOG = "Example:  latticebench figures runs/default --out results/default"
 
@@ -15,7 +23,10 @@ EPILOG = "Example:  latticebench figures runs/default --out results/default"
 def figures(
     folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
     out: Annotated[
-        Path | None, typer.Option(parser=place, metavar="DIR", help="Where to write them; DIR/figures if not given.")
+        Path | None,
+        typer.Option(
+            parser=place, metavar="DIR", help="Where to write them; DIR/figures if not given. One figure: a .png."
+        ),
     ] = None,
     only: Annotated[
         list[str] | None, typer.Option(help="Draw this kind of figure alone; may be given several times.")
@@ -26,5 +37,32 @@ def figures(
     from latticebench.bench.store import open_store
 
     kinds.check_figures(only)
-    for path in kinds.draw(open_store(folder), folder / "figures" if out is None else out, only):
+    store = open_store(folder)
+    if out is not None and out.suffix.lower() in ENDINGS:
+        _draw_one(store, out, only)
+        return
+    for path in kinds.draw(store, folder / "figures" if out is None else out, only):
         print(path)
+
+
+def _draw_one(store: Store, out: Path, only: list[str] | None) -> None:
+    """Draw a single figure into a file.
+
+    Raises:
+        InputError: it is to be something else than a PNG, or there are several figures, or none.
+    """
+    from latticebench.bench import kinds
+    from latticebench.systems.files import check_outputs, shown, whole
+
+    if out.suffix.lower() != ".png":
+        raise unknown("ending", out.suffix, [".png"], f"--out {shown(out)}")
+    check_outputs({"--out": out})
+    with tempfile.TemporaryDirectory() as drawn:
+        found = kinds.draw(store, Path(drawn), only)
+        if len(found) != 1:
+            raise InputError(
+                f"--out {shown(out)}: there are {len(found)} figures; choose one with --only, or give a folder"
+            )
+        with whole(out) as temporary:
+            temporary.write_bytes(found[0].read_bytes())
+    print(shown(out))

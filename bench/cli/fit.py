@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,8 +22,15 @@ from latticebench.bench.cli.options import (
     Terms,
     TimeLimit,
     check_places,
+    place,
 )
 from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, layout_of, read_told
+
+if TYPE_CHECKING:
+    from latticebench.bench.adequacy import Adequacy
+    from latticebench.bench.report.units import Units
+    from latticebench.methods.method import Fit
+    from latticebench.systems.samples import Samples
 
 EPILOG = (
     "Examples:  latticebench fit phi4.csv --system phi4 --library lib2 --method stlsq --set threshold=0.1\n\n"
@@ -53,6 +60,9 @@ def fit(
     scale: Scale = "1",
     sort: Sort = False,
     json_out: JsonOut = None,
+    html_out: Annotated[
+        Path | None, typer.Option("--html", metavar="OUT", parser=place, help="Write one HTML file with pictures.")
+    ] = None,
 ) -> None:
     """Fit the coefficients of a library to recorded samples.
 
@@ -66,10 +76,10 @@ def fit(
     from latticebench.bench.report.screen import show_fit, waiting
     from latticebench.bench.report.units import in_words, units_of
     from latticebench.methods.method import make
-    from latticebench.systems.files import check_regular, write_text
+    from latticebench.systems.files import check_regular
 
     method = methods.DEFAULT if method is None else method
-    check_places([*files, system, method], json=json_out)
+    check_places([*files, system, method], json=json_out, html=html_out)
     layout = layout_of(time, columns, scale, sort)
     own = code_file(method)
     if own is None:
@@ -94,13 +104,32 @@ def fit(
     units = units_of(data[0].origin)
     if json_out != "-":
         show_fit(found, quality, in_words(units))
-    if json_out is None:
-        return
-    from latticebench.bench.report.document import provenance, to_json
-    from latticebench.bench.report.outputs import fit_document
+    _write(found, data, (quality, units), seed, json_out, html_out)
 
-    text = to_json(fit_document(found, quality, units, provenance([seed])))
-    if json_out == "-":
-        print(text, end="")
-    else:
-        write_text(Path(json_out), text)
+
+def _write(
+    found: Fit,
+    data: list[Samples],
+    said: tuple[Adequacy, Units],
+    seed: int,
+    json_out: str | None,
+    html_out: Path | None,
+) -> None:
+    """Write a fit, with its quality and units, as JSON and as a page, each where it is asked for."""
+    from latticebench.bench.overlay import of_fit
+    from latticebench.bench.report.document import provenance, to_json
+    from latticebench.bench.report.fit_page import write_fit_page
+    from latticebench.bench.report.outputs import fit_document
+    from latticebench.systems.files import write_text
+
+    if json_out is None and html_out is None:
+        return
+    overlay, about = of_fit(data, found), provenance([seed])
+    if json_out is not None:
+        text = to_json(fit_document(found, *said, about, overlay))
+        if json_out == "-":
+            print(text, end="")
+        else:
+            write_text(Path(json_out), text)
+    if html_out is not None:
+        write_fit_page(found, overlay, about, html_out)

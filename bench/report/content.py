@@ -17,12 +17,14 @@ from latticebench.bench.report.horizons import HorizonReport, horizons
 from latticebench.bench.report.modes import Modes, modes
 from latticebench.bench.report.notes import notes
 from latticebench.bench.report.separation import Separation, separations
+from latticebench.bench.report.shown import Shown
 from latticebench.bench.report.units import Units, in_sentence, noise_in_words, units_of
 from latticebench.bench.report.whereabouts import Whereabouts, whereabouts
 from latticebench.diagnosis.instrument import step_of
 from latticebench.methods.engine.dynamics import split_parts
 
 if TYPE_CHECKING:
+    from latticebench.bench.overlay import Overlay
     from latticebench.diagnosis.acting import Chain
     from latticebench.diagnosis.fitting import Fitted
     from latticebench.diagnosis.repair import Diagnosis
@@ -144,11 +146,16 @@ class Report(Content):
 
 
 class DiagnosisDocument(Report, Document):
-    """A diagnosis, see `latticebench diagnose`."""
+    """A diagnosis, see `latticebench diagnose`.
+
+    Attributes:
+        shown: what `latticebench plot` draws of it; None in a document of a version that did not draw.
+    """
 
     schema_: Literal["latticebench/diagnosis/2"] = pydantic.Field(
         default="latticebench/diagnosis/2", validation_alias="schema", serialization_alias="schema"
     )
+    shown: Shown | None = None
 
 
 def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
@@ -180,9 +187,10 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
     )  # fmt: skip
 
 
-def diagnosis_document(report: Report, about: Provenance) -> DiagnosisDocument:
-    """Return the document of a diagnosis."""
-    return DiagnosisDocument(provenance=about, **{name: getattr(report, name) for name in Report.model_fields})
+def diagnosis_document(report: Report, about: Provenance, overlay: Overlay | None = None) -> DiagnosisDocument:
+    """Return the document of a diagnosis, with what is drawn of it."""
+    said = {name: getattr(report, name) for name in Report.model_fields}
+    return DiagnosisDocument(provenance=about, shown=None if overlay is None else Shown.of(overlay), **said)
 
 
 def _sentence(verdict: str, found: tuple[AddedEffect, ...]) -> str:

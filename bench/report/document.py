@@ -6,6 +6,7 @@ A number that is not known (NaN) is `null` in JSON, an infinite one the text "in
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -13,6 +14,10 @@ import pydantic
 from typing_extensions import TypeAliasType
 
 from latticebench.bench.provenance import command_line, origin
+
+# A list of numbers over several lines; no text of JSON has a line break.
+_ENTRY = r'(?:-?\d[\d.eE+-]*|null|"-?inf")'
+NUMBERS = re.compile(rf"\[\n\s+({_ENTRY}(?:,\s+{_ENTRY})*)\s+\]")
 
 
 def _read(value: Any) -> Any:
@@ -86,8 +91,9 @@ def provenance(seeds: Sequence[int] = ()) -> Provenance:
 
 
 def to_json(content: Content) -> str:
-    """Return a document as the text of a JSON file."""
-    return content.model_dump_json(by_alias=True, indent=2) + "\n"
+    """Return a document as the text of a JSON file; lists of numbers are written in one line."""
+    text = content.model_dump_json(by_alias=True, indent=2)
+    return NUMBERS.sub(lambda found: "[" + re.sub(r"\s+", " ", found[1]) + "]", text) + "\n"
 
 
 def to_dict(content: Content) -> dict[str, Any]:

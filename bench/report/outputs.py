@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, JsonValue
 
 from latticebench.bench.report.document import Content, Document, Number, Provenance
+from latticebench.bench.report.shown import Shown
 from latticebench.bench.report.units import Units
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from latticebench.bench.compare import Comparison
     from latticebench.bench.inspection import Inspection
     from latticebench.bench.limit import Design, Limit
+    from latticebench.bench.overlay import Overlay
     from latticebench.methods.method import Fit
 
 # pandas has NaN where a text or a truth value is missing.
@@ -44,6 +46,7 @@ class FitDocument(Document):
         quality: how well the equation describes the readings.
         warnings: what has to be known before a number is used; empty where the equation fits.
         units: of times, readings and the equation.
+        shown: what `latticebench plot` draws of it; None in a document of a version that did not draw.
     """
 
     schema_: Literal["latticebench/fit/1"] = Field(
@@ -59,6 +62,7 @@ class FitDocument(Document):
     quality: Quality
     warnings: list[str]
     units: Units
+    shown: Shown | None = None
 
 
 class TermLimit(Content):
@@ -279,8 +283,10 @@ class ListDocument(Document):
     rows: list[dict[str, JsonValue]]
 
 
-def fit_document(found: Fit, quality: Adequacy, units: Units, about: Provenance) -> FitDocument:
-    """Return the document of a fit."""
+def fit_document(
+    found: Fit, quality: Adequacy, units: Units, about: Provenance, overlay: Overlay | None = None
+) -> FitDocument:
+    """Return the document of a fit, with what is drawn of it."""
     texts = found.library.texts
     return FitDocument(
         provenance=about, method=found.method, order=found.order,
@@ -289,6 +295,7 @@ def fit_document(found: Fit, quality: Adequacy, units: Units, about: Provenance)
         residual=found.residual, seconds=found.seconds, status=found.status,
         quality=Quality(work=quality.work, r2=quality.r2, times=quality.times, fits=quality.fits),
         warnings=list(quality.warnings), units=units,
+        shown=None if overlay is None else Shown.of(overlay),
     )  # fmt: skip
 
 

@@ -39,9 +39,9 @@ def write_page(report: Report, curves: PictureCurves, about: Provenance | None, 
 def page(report: Report, curves: PictureCurves, about: Provenance | None = None) -> str:
     """Return the page of a diagnosis; the arguments are those of `write_page`."""
     frequencies = [one.parameters["omega"] for one in report.effects if "omega" in one.parameters]
-    environment = _environment()
-    style, _, _ = environment.loader.get_source(environment, "diagnosis.css")  # type: ignore[union-attr]
-    return environment.get_template("diagnosis.html.j2").render(
+    templates = environment()
+    style, _, _ = templates.loader.get_source(templates, "diagnosis.css")  # type: ignore[union-attr]
+    return templates.get_template("diagnosis.html.j2").render(
         report=report, curves=curves, style=style, pictures=pictures.draw(curves, [float(one) for one in frequencies]),
         effects=rows.effects(report), coefficients=rows.coefficients(report), errors=rows.errors(report),
         modes=rows.modes(report), horizons=rows.horizons(report), left=rows.left(report), tried=_bars(report),
@@ -52,18 +52,18 @@ def page(report: Report, curves: PictureCurves, about: Provenance | None = None)
     )  # fmt: skip
 
 
-def _environment() -> jinja2.Environment:
+def environment() -> jinja2.Environment:
     """Return the templates of this package; they escape what they are given, and refuse a name that is missing."""
     import jinja2
     import markupsafe
 
-    environment = jinja2.Environment(
+    found = jinja2.Environment(
         loader=jinja2.PackageLoader("latticebench.bench.report", "templates"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    environment.filters["digits"] = lambda value, count: f"{value:.{count}g}"
-    environment.filters["markup"] = markupsafe.Markup
-    return environment
+    found.filters["digits"] = lambda value, count: f"{value:.{count}g}"
+    found.filters["markup"] = markupsafe.Markup
+    return found
 
 
 def _bars(report: Report) -> list[dict[str, Any]]:

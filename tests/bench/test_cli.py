@@ -105,6 +105,7 @@ def test_a_fit_prints_its_equation_and_writes_json_in_the_order_of_the_terms(fol
         "quality",
         "warnings",
         "units",
+        "shown",
     ]
     assert list(written) == ["schema", "provenance", *keys]
     assert list(written["coefficients"]) == ["u[n+1]", "u[n-1]", "u[n]", "u[n]**3"]

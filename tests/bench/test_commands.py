@@ -62,7 +62,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "fit": (
         ("t.csv", "--system", "phi4", "--library", "lib1", "--ends", "free", "--method", "zero"),
-        (*FITTED, "--method", "--set", "--seed"),
+        (*FITTED, "--method", "--set", "--seed", "--html"),
     ),
     # Not from the system: the search for what an error would need takes long.
     "limit": (("missing.csv", "--system", "phi4", "--library", "lib1"), (*FITTED, *SIMULATED, "--target")),
@@ -70,6 +70,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "table": (("store",), ("--out", "--value", "--only", "--json")), "figures": (("store",), ("--out", "--only")),
     "compare": (("store", "store"), ("--factor", "--json")), "schema": ((), ("--out",)), "data": ((), ("--json",)),
     "list": (("systems",), ("--json",)),
+    "plot": (("t.csv", "--only", "map", "--out", "x.svg"), ("--out", "--animate", "--only", "--trajectory")),
     "run": (("s.toml", "--jobs", "1", "--results", "store"), ("--jobs", "--results", "--shard", "--data", "--json")),
 }  # fmt: skip
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
+from latticebench.bench.colours import SERIES
 from latticebench.bench.figures import draw_all, error_against_noise, panel
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.worker import outcome
@@ -33,7 +34,7 @@ def test_a_panel_shows_found_solid_true_dashed_and_absent_black() -> None:
     solid = [line for line in axes.lines if line.get_linestyle() == "-"]
     dashed = [line for line in axes.lines if line.get_linestyle() == "--"]
     assert [list(line.get_ydata()) for line in solid] == [[0, 1, 1.9], [0, 0.3, 0.1]]
-    assert [line.get_color() for line in solid] == ["tab:blue", "black"]
+    assert [line.get_color() for line in solid] == [SERIES[0], "black"]
     assert len(dashed) == 1
     assert set(dashed[0].get_ydata()) == {2.0}
 

@@ -1,0 +1,76 @@
+"""A fit as one HTML file: the data, the equation on top, what it leaves, the table; no scripts, nothing from elsewhere.
+
+The template escapes every text. Markup is only what SymPy and matplotlib write, and the style sheet.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from latticebench.bench.overlay import Overlay
+from latticebench.bench.plots import panels, plot
+from latticebench.bench.provenance import lines
+from latticebench.bench.report.document import Provenance
+from latticebench.bench.report.mathematics import written
+from latticebench.bench.report.page import environment
+from latticebench.systems.files import write_text
+
+if TYPE_CHECKING:
+    from latticebench.methods.method import Fit
+
+CAPTIONS = {
+    "map": "The readings, site against time.",
+    "sites": "Readings, and the motion of the equation that is nearest to them.",
+    "residual": "What the equation leaves of the readings.",
+    "spectrum": "The spectrum of what it leaves.",
+    "phase": "The readings in their phase plane.",
+}
+
+
+def write_fit_page(found: Fit, overlay: Overlay, about: Provenance | None, path: Path) -> None:
+    """Write the page of a fit, whole or not at all.
+
+    Args:
+        found: the fit.
+        overlay: its readings and curves.
+        about: where it comes from.
+        path: the file.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    write_text(path, fit_page(found, overlay, about))
+
+
+def fit_page(found: Fit, overlay: Overlay, about: Provenance | None = None) -> str:
+    """Return the page of a fit; the arguments are those of `write_fit_page`."""
+    made = environment()
+    style, _, _ = made.loader.get_source(made, "diagnosis.css")  # type: ignore[union-attr]
+    columns = ["term", "coefficient", *([] if found.stderr is None else ["standard error"])]
+    errors = [None] * len(found.coefficients) if found.stderr is None else found.stderr.tolist()
+    rows = [
+        [text, f"{value:.6g}", *([] if error is None else [f"{error:.2g}"])]
+        for text, value, error in zip(found.library.texts, found.coefficients.tolist(), errors, strict=True)
+    ]
+    return made.get_template("fit.html.j2").render(
+        found=found, overlay=overlay, style=style, equation=written(found), columns=columns, rows=rows,
+        pictures={name: (CAPTIONS[name], _svg(overlay, name)) for name in panels(overlay)},
+        origin=[] if about is None else [line.partition(": ")[::2] for line in lines(about.model_dump())],
+    )  # fmt: skip
+
+
+def _svg(overlay: Overlay, panel: str) -> str:
+    """Draw a panel as an SVG element that is as wide as its place."""
+    import matplotlib as mpl
+
+    picture = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": panel}):
+        nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
+        plot(overlay, [panel], titled=False).savefig(picture, format="svg", transparent=True, metadata=nothing, dpi=140)
+    text = picture.getvalue()
+    text = text[text.index("<svg ") :]
+    head, _, rest = text.partition(">")
+    kept = " ".join(word for word in head.split(" ") if not word.startswith(("width=", "height=", "version=")))
+    return f"{kept}>{rest}"

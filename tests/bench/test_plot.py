@@ -1,0 +1,184 @@
+"""Pictures of recordings, fits and diagnoses."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from latticebench import methods, systems
+from latticebench.bench import animation
+from latticebench.bench.cli import main
+from latticebench.bench.overlay import Overlay, of_fit, of_recording
+from latticebench.bench.plots import panels, plot
+from latticebench.bench.report.fit_page import fit_page
+from latticebench.bench.report.shown import Shown
+from latticebench.methods.method import make, solve
+from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import observe, simulate
+from latticebench.systems.writers import write
+
+Run = Callable[..., tuple[int, str]]
+FIRST = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}
+TERMS = "u[n+1]+u[n-1]-2*u[n]; u[n]; u[n]**3"
+
+
+@pytest.fixture(scope="module")
+def swings() -> Samples:
+    """A wave along six sites, with 1 % noise."""
+    phi4 = systems.find("phi4")
+    clean = simulate(phi4, sites=6, times=np.arange(60) * 0.2, initial="wave")
+    return replace(observe(clean, np.random.default_rng(3), noise=0.01).observed(), ends=phi4.ends)
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command within this process, and return its exit code and what it complains of."""
+
+    def command(*words: str) -> tuple[int, str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["latticebench", *words])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return int(end.value.code or 0), capsys.readouterr().err
+
+    return command
+
+
+def fitted(swings: Samples, terms: str, method: str) -> Overlay:
+    own = library("terms", terms)
+    return of_fit([swings], solve(make(methods.find(method), {}), [swings], own, 2, 1))
+
+
+def test_a_method_without_a_motion_is_shown_with_the_nearest_motion_of_its_equation(swings: Samples) -> None:
+    """The right equation leaves the noise, whoever found it, although the start is fitted to noisy readings."""
+    sigma = np.std(swings.u) * 0.01
+    for method in ("least-squares", "trajectory"):
+        shown = fitted(swings, TERMS, method)
+        left = shown.seen - shown.curves[method]
+        assert 0.5 * sigma < np.sqrt(np.mean(left**2)) < 4 * sigma
+
+
+def test_what_a_wrong_equation_leaves_is_not_taken_for_noise(swings: Samples) -> None:
+    shown = fitted(swings, "u[n]", "trajectory")
+    assert np.sqrt(np.nanmean(shown.residual("trajectory") ** 2)) > 5
+
+
+def test_an_equation_that_runs_away_is_drawn_as_far_as_it_goes(swings: Samples) -> None:
+    alone = of_recording(swings)
+    away = np.where(alone.t[:, None, None] < 3, np.exp(10 * alone.t)[:, None, None] * alone.seen, np.nan)
+    figure = plot(replace(alone, curves={"wild": away}), ["sites"])
+    low, high = figure.get_axes()[0].get_ylim()
+    assert high - low < 4 * np.ptp(swings.u)
+    # Of an equation that blows up before the second reading nothing is known there.
+    blown = fitted(swings, "exp(u[n]*50)", "least-squares").curves["least-squares"]
+    assert np.all(np.isfinite(blown[0]))
+
+
+def test_a_document_is_drawn_as_what_was_written(swings: Samples) -> None:
+    shown = fitted(swings, TERMS, "least-squares")
+    again = Shown.model_validate_json(Shown.of(shown).model_dump_json()).overlay()
+    np.testing.assert_allclose(again.seen, shown.seen, rtol=1e-5)
+    np.testing.assert_allclose(again.curves["least-squares"], shown.curves["least-squares"], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("sites", "kind"), [(1, float), (3, complex), (8, float)])
+def test_every_panel_is_drawn_of_any_chain_with_gaps_and_uneven_times(sites: int, kind: type) -> None:
+    draws = np.random.default_rng(1)
+    u = draws.normal(size=(30, sites)).astype(kind)
+    u[4:9, 0] = np.nan
+    alone = of_recording(Samples(np.cumsum(draws.uniform(0.1, 1, 30)), u))
+    for overlay in (alone, Overlay("x", 30, alone.t, alone.seen, curves={"a": 0.9 * alone.seen, "b": alone.seen})):
+        figure = plot(overlay, list(panels(overlay)))
+        figure.draw_without_rendering()
+        assert sum(part.get_visible() for part in figure.get_axes()) >= len(panels(overlay))
+
+
+def test_pictures_are_what_their_ending_says_and_films_move(run: Run, swings: Samples, tmp_path: Path) -> None:
+    write([replace(swings, t=swings.t[:9], u=swings.u[:9], v=None)], tmp_path / "swings.csv")
+    for ending, begin in FIRST.items():
+        film = ("--animate", "a.gif") if ending == ".svg" else ()
+        assert run("plot", "swings.csv", "--only", "map", "--out", f"a{ending}", *film) == (0, "")
+        assert (tmp_path / f"a{ending}").read_bytes().startswith(begin)
+    with Image.open(tmp_path / "a.png") as picture:
+        assert "latticebench plot swings.csv" in picture.info["Description"]
+    with Image.open(tmp_path / "a.gif") as film:
+        assert film.n_frames == 9  # type: ignore[attr-defined]
+
+
+def test_a_fit_is_drawn_from_its_document_alone(run: Run, swings: Samples, tmp_path: Path) -> None:
+    write([swings], tmp_path / "swings.csv")
+    terms = ("--terms", TERMS, "--order", "2", "--method", "least-squares")
+    assert run("fit", "swings.csv", *terms, "--json", "fit.json") == (0, "")
+    (tmp_path / "swings.csv").unlink()
+    assert run("plot", "fit.json", "--out", "fit.png", "--only", "sites") == (0, "")
+    old = json.loads((tmp_path / "fit.json").read_text())
+    for changed, reason in (
+        ({**old, "shown": None}, "write it again"), ({**old, "schema": "latticebench/run/1"}, "no document of"),
+        ({**old, "shown": {**old["shown"], "t": [0.0]}}, "do not match"), ([], "no document of"),
+    ):  # fmt: skip
+        (tmp_path / "other.json").write_text(json.dumps(changed))
+        code, said = run("plot", "other.json", "--out", "other.png")
+        assert (code, len(said.splitlines())) == (2, 1)
+        assert reason in said
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--out", "a.jpg"), "unknown ending '.jpg'"), (("--out", "a"), "known: .pdf, .png, .svg"),
+        (("--animate", "a.png"), "known: .gif, .mp4"), ((), "give --out FILE"),
+        (("--out", "a.png", "--only", "residual"), "unknown panel"), (("--out", "a.png", "--trajectory", "2"), "has 1"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_drawn_is_refused_in_one_line(
+    words: tuple[str, ...], reason: str, run: Run, swings: Samples, tmp_path: Path
+) -> None:
+    write([swings], tmp_path / "swings.csv")
+    code, said = run("plot", "swings.csv", *words)
+    assert (code, len(said.splitlines())) == (2, 1)
+    assert reason in said
+    assert [path.name for path in tmp_path.iterdir()] == ["swings.csv"]
+
+
+def test_a_figure_of_a_run_is_the_picture_that_its_place_says(run: Run, tmp_path: Path) -> None:
+    suite = '[methods.zero]\nmethod = "zero"\n[[grid]]\nsystem = "phi4"\nsites = 5\nsamples = 8\nlibraries = ["lib1"]\n'
+    (tmp_path / "s.toml").write_text(suite)
+    assert run("run", "s.toml", "--jobs", "1", "--results", "store")[0] == 0
+    assert run("figures", "store", "--only", "errors", "--out", "errors.png") == (0, "")
+    assert (tmp_path / "errors.png").read_bytes().startswith(FIRST[".png"])
+    for out, reason in (("all.png", "there are 2 figures"), ("errors.svg", "unknown ending '.svg'")):
+        code, said = run("figures", "store", "--out", out)
+        assert (code, reason in said) == (2, True)
+        assert not (tmp_path / out).exists()
+
+
+def test_mp4_without_ffmpeg_is_refused_with_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from matplotlib.animation import FFMpegWriter
+
+    monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
+    with pytest.raises(InputError, match="install it"):
+        animation.check_film(tmp_path / "a.mp4")
+    animation.check_film(tmp_path / "a.gif")
+
+
+def test_the_page_of_a_fit_has_data_table_and_pictures_and_lets_nothing_run(swings: Samples) -> None:
+    evil = "<script>document.title='owned'</script>$x.csv"
+    own = library("terms", TERMS)
+    found = solve(make(methods.find("weak"), {}), [swings], own, 2, 1)
+    overlay = of_fit([replace(swings, source=evil)], found)
+    text = fit_page(found, overlay)
+    assert "<script" not in text
+    assert "default-src 'none'" in text
+    assert text.count("<svg ") == len(panels(overlay)) == 5
+    assert "standard error" in text
+    for term in own.texts:
+        assert f"<td>{term}</td>" in text
