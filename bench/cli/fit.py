@@ -28,7 +28,6 @@ from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, la
 
 if TYPE_CHECKING:
     from latticebench.bench.adequacy import Adequacy
-    from latticebench.bench.report.units import Units
     from latticebench.methods.method import Fit
     from latticebench.systems.samples import Samples
 
@@ -73,8 +72,7 @@ def fit(
     from latticebench.bench.apart import Apart, fit_apart, fit_here
     from latticebench.bench.case import code_file
     from latticebench.bench.inspection import sine_warning
-    from latticebench.bench.report.screen import show_fit, waiting
-    from latticebench.bench.report.units import in_words, units_of
+    from latticebench.bench.report.screen import waiting
     from latticebench.methods.method import make
     from latticebench.systems.files import check_regular
 
@@ -101,32 +99,29 @@ def fit(
             found = fit_apart(asked_for, candidates)
         with redirect_stdout(sys.stderr):
             quality = adequacy(data, found).also(sine_warning(data, candidates))
-    units = units_of(data[0].origin)
-    if json_out != "-":
-        show_fit(found, quality, in_words(units))
-    _write(found, data, (quality, units), seed, json_out, html_out)
+    _report(found, data, quality, seed, json_out, html_out)
 
 
-def _write(
-    found: Fit,
-    data: list[Samples],
-    said: tuple[Adequacy, Units],
-    seed: int,
-    json_out: str | None,
-    html_out: Path | None,
+def _report(
+    found: Fit, data: list[Samples], quality: Adequacy, seed: int, json_out: str | None, html_out: Path | None
 ) -> None:
-    """Write a fit, with its quality and units, as JSON and as a page, each where it is asked for."""
+    """Show a fit and how well its equation fits, and write it as JSON and as a page, each where it is asked for."""
     from latticebench.bench.overlay import of_fit
     from latticebench.bench.report.document import provenance, to_json
     from latticebench.bench.report.fit_page import write_fit_page
     from latticebench.bench.report.outputs import fit_document
+    from latticebench.bench.report.screen import show_fit
+    from latticebench.bench.report.units import in_words, units_of
     from latticebench.systems.files import write_text
 
+    units = units_of(data[0].origin)
+    if json_out != "-":
+        show_fit(found, quality, in_words(units))
     if json_out is None and html_out is None:
         return
     overlay, about = of_fit(data, found), provenance([seed])
     if json_out is not None:
-        text = to_json(fit_document(found, *said, about, overlay))
+        text = to_json(fit_document(found, quality, units, about, overlay))
         if json_out == "-":
             print(text, end="")
         else:

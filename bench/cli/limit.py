@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,9 +17,11 @@ from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, layout_of
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
-    from latticebench.bench.bounds import BoundAt
+    from latticebench.bench.bounds import BoundAt, Recorded
     from latticebench.bench.fitting import FitCase
     from latticebench.bench.limit import Limit
+    from latticebench.systems.lattice import Library
+    from latticebench.systems.samples import Samples
 
 EPILOG = (
     "Examples:  latticebench limit --system phi4 --set C=2 --library lib4 --noise 0.01\n\n"
@@ -68,9 +71,6 @@ def limit(
     Options from --set to --initial are about samples of a system; of recorded ones everything is known but their
     noise, which is what a fit leaves at each sensor.
     """
-    from latticebench.bench.bounds import of_recordings
-    from latticebench.bench.report.screen import waiting
-
     check_places([*(files or ()), system], json=json_out)
     known, candidates, order = asked(system, library, terms, order)
     simulated = {
@@ -82,13 +82,7 @@ def limit(
     if files:
         for name in described:
             raise InputError(f"--{name}: files are given, whose samples are as they are; leave it out, or the files")
-        data = read_told(files, ends or "unknown", layout)
-        with (
-            told(data, None, "the fit"),
-            waiting(f"fitting {len(candidates.terms)} terms"),
-            redirect_stdout(sys.stderr),
-        ):
-            found = of_recordings(data, candidates, order)
+        found = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
         note, bound_at, warnings = found.note, found.at, found.warnings
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
@@ -102,6 +96,16 @@ def limit(
         note, bound_at = _of_simulated(case, None if yes else case.sites or known.sites)
         warnings = ()
     _report(note, bound_at, target, json_out, warnings)
+
+
+def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> Recorded:
+    """Return the bound of recordings, while a terminal is told what is waited for."""
+    from latticebench.bench.bounds import of_recordings
+    from latticebench.bench.report.screen import waiting
+
+    fitting = f"fitting {len(candidates.terms)} terms"
+    with told(data, None, "the fit"), waiting(fitting), redirect_stdout(sys.stderr):
+        return of_recordings(data, candidates, order)
 
 
 def _of_simulated(case: FitCase, sites: int | None) -> tuple[str, BoundAt]:
