@@ -1,4 +1,4 @@
-"""The bound of recordings: along the motion that a fit follows, with the noise that it leaves."""
+"""A bound that can be asked for more samples, and that of recordings: along the motion that a fit follows."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ BoundAt = Callable[[int, int], Limit]
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
-    """The bound of recordings.
+class BoundOf:
+    """The bound of some samples, of as many again, and of longer records.
 
     Attributes:
         at: the bound.
@@ -32,7 +32,7 @@ class Recorded:
     warnings: tuple[str, ...]
 
 
-def of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> Recorded:
+def of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> BoundOf:
     """Fit recordings by the method that gives the motion it follows, and return the bound along that.
 
     Raises:
@@ -52,4 +52,4 @@ def of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> R
         f"{data[0].source}: bound along the motion that {fit.method!r} fits to the samples, with the noise that it "
         "leaves" + ("" if fit.status == "ok" else f" ({fit.status})")
     )
-    return Recorded(bound_at, "\n".join([note, *(f"noise of {line}" for line in left.lines)]), left.warning)
+    return BoundOf(bound_at, "\n".join([note, *(f"noise of {line}" for line in left.lines)]), left.warning)

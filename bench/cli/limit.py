@@ -17,7 +17,7 @@ from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, layout_of
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
-    from latticebench.bench.bounds import BoundAt, Recorded
+    from latticebench.bench.bounds import BoundOf
     from latticebench.bench.fitting import FitCase
     from latticebench.bench.limit import Limit
     from latticebench.systems.lattice import Library
@@ -31,7 +31,7 @@ EPILOG = (
 
 def limit(
     files: Annotated[
-        list[Path] | None, typer.Argument(help="Recorded samples; without any, samples of --system are taken.")
+        list[Path] | None, typer.Argument(help="BoundOf samples; without any, samples of --system are taken.")
     ] = None,
     system: Annotated[
         str | None,
@@ -82,8 +82,7 @@ def limit(
     if files:
         for name in described:
             raise InputError(f"--{name}: files are given, whose samples are as they are; leave it out, or the files")
-        found = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
-        note, bound_at, warnings = found.note, found.at, found.warnings
+        bound = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
     else:
@@ -93,12 +92,11 @@ def limit(
             terms=candidates.texts if terms is not None else (), ends=None if ends == "unknown" else ends,
             **{"noise": 0.01, **described},
         )  # fmt: skip
-        note, bound_at = _of_simulated(case, None if yes else case.sites or known.sites)
-        warnings = ()
-    _report(note, bound_at, target, json_out, warnings)
+        bound = _of_simulated(case, None if yes else case.sites or known.sites)
+    _report(bound, target, json_out)
 
 
-def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> Recorded:
+def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> BoundOf:
     """Return the bound of recordings, while a terminal is told what is waited for."""
     from latticebench.bench.bounds import of_recordings
     from latticebench.bench.report.screen import waiting
@@ -108,8 +106,9 @@ def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> 
         return of_recordings(data, candidates, order)
 
 
-def _of_simulated(case: FitCase, sites: int | None) -> tuple[str, BoundAt]:
-    """Return where the bound of simulated samples is taken, and the bound; without `sites` they may be any size."""
+def _of_simulated(case: FitCase, sites: int | None) -> BoundOf:
+    """Return the bound of simulated samples; without `sites` they may be any size."""
+    from latticebench.bench.bounds import BoundOf
     from latticebench.bench.effort import check_size
     from latticebench.bench.fitting import bound
 
@@ -120,26 +119,26 @@ def _of_simulated(case: FitCase, sites: int | None) -> tuple[str, BoundAt]:
         changed = {"samples": case.samples * more * longer, "span": case.span * longer}
         return bound(case.model_copy(update=changed), Path())
 
-    return f"{case.data}: bound at the truth of the system", bound_at
+    return BoundOf(bound_at, f"{case.data}: bound at the truth of the system", ())
 
 
-def _report(note: str, bound_at: BoundAt, target: float, json_out: str | None, warnings: tuple[str, ...]) -> None:
+def _report(bound: BoundOf, target: float, json_out: str | None) -> None:
     """Take the bound and show it, or write it as JSON."""
     from latticebench.bench.limit import design
     from latticebench.bench.report.screen import show_limit, waiting
     from latticebench.systems.files import write_text
 
     with waiting("taking the bound"):
-        found = bound_at(1, 1)
-        needed = design(bound_at, target=target)
+        found = bound.at(1, 1)
+        needed = design(bound.at, target=target)
     if json_out != "-":
-        show_limit(found, needed, note, warnings)
+        show_limit(found, needed, bound.note, bound.warnings)
     if json_out is None:
         return
     from latticebench.bench.report.document import provenance, to_json
     from latticebench.bench.report.outputs import limit_document
 
-    text = to_json(limit_document(found, needed, note, provenance([1]), warnings))
+    text = to_json(limit_document(found, needed, bound.note, provenance([1]), bound.warnings))
     if json_out == "-":
         print(text, end="")
     else:
