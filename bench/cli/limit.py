@@ -28,26 +28,27 @@ EPILOG = (
     "           latticebench limit phi4.csv --system phi4 --library lib2 --ends free"
 )
 
+System = Annotated[
+    str | None,
+    typer.Option(help="What moves; with files, where order and libraries come from.", autocompletion=complete_systems),
+]
+Ends = Annotated[
+    AnyEnds | None,
+    typer.Option(
+        help="How the chain ends, as far as the fit knows: the system's own, with files unknown, if not given."
+    ),
+]
+
 
 def limit(
     files: Annotated[
         list[Path] | None, typer.Argument(help="BoundOf samples; without any, samples of --system are taken.")
     ] = None,
-    system: Annotated[
-        str | None,
-        typer.Option(
-            help="What moves; with files, where order and libraries come from.", autocompletion=complete_systems
-        ),
-    ] = None,
+    system: System = None,
     library: LibraryName = None,
     terms: Terms = None,
     order: Order = None,
-    ends: Annotated[
-        AnyEnds | None,
-        typer.Option(
-            help="How the chain ends, as far as the fit knows: the system's own, with files unknown, if not given."
-        ),
-    ] = None,
+    ends: Ends = None,
     target: Annotated[float, typer.Option(help="Wanted relative error of the coefficients.")] = 0.01,
     given: Settings = None,
     sites: Annotated[int | None, typer.Option(help="Number of sites N.")] = None,
