@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from latticebench.bench.cli.options import check_places, place
+from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, layout_of, read_told
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
     from latticebench.bench.overlay import Overlay
+    from latticebench.systems.layout import Layout
 
 EPILOG = (
     "Examples:  latticebench plot phi4.csv --out phi4.png --animate phi4.gif\n\n"
@@ -33,6 +35,10 @@ def plot(
         typer.Option(help="Draw this panel alone: map, sites, residual, spectrum, phase; may be given several times."),
     ] = None,
     trajectory: Annotated[int, typer.Option(min=1, help="Which trajectory of a recording is drawn.")] = 1,
+    time: Time = None,
+    columns: Columns = None,
+    scale: Scale = "1",
+    sort: Sort = False,
 ) -> None:
     """Draw a recording, or a fit or a diagnosis on top of its readings: maps, lines, residual, spectra, portraits."""
     from latticebench.bench.animation import FILMS, check_film
@@ -52,7 +58,7 @@ def plot(
     if animate is not None:
         check_film(animate)
     check_places([file], out=out, animate=animate)
-    overlay = _overlay(file, trajectory)
+    overlay = _overlay(file, trajectory, layout_of(time, columns, scale, sort))
     for name in only or ():
         if name not in panels(overlay):
             raise unknown("panel", name, panels(overlay), "--only")
@@ -64,18 +70,17 @@ def plot(
         print(shown(animate))
 
 
-def _overlay(file: Path, trajectory: int) -> Overlay:
+def _overlay(file: Path, trajectory: int, layout: Layout) -> Overlay:
     """Read what is drawn.
 
     Raises:
         InputError: the file cannot be read, or there is nothing in it that can be drawn.
     """
     from latticebench.bench.overlay import of_recording
-    from latticebench.systems.readers import read
 
     if file.suffix.lower() == ".json":
         return _written(file)
-    data = read(file)
+    data = read_told([file], "unknown", layout)
     if trajectory > len(data):
         raise InputError(f"--trajectory {trajectory}: {shown(file)} has {len(data)}")
     return of_recording(data[trajectory - 1])
