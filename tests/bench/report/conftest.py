@@ -89,7 +89,8 @@ def _forms(effect: Effect, chain: Chain) -> list[Placed]:
 
 def _curve(t: np.ndarray, seen: np.ndarray, level: np.ndarray) -> Any:
     """Readings (T, N) beside what a model reads."""
-    return SimpleNamespace(t=t, seen=seen[:, None, None], level=level[:, None, None], field=level[:, None, None])
+    shown = {"seen": seen, "level": level, "field": level, "swing": level - np.mean(level, axis=0)}
+    return SimpleNamespace(t=t, **{name: value[:, None, None] for name, value in shown.items()})
 
 
 def _fitted(model: Model, chain: Chain, noise: Noise, curves: list[Any], **options: Any) -> Any:
