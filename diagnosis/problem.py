@@ -221,7 +221,7 @@ class Problem:
     def price(self, name: str, numbers: int) -> float:
         """Return the nats that an effect must bring: noise brings as many in its share of `rules.FALSE_ALARM`."""
         share = rules.FALSE_ALARM / max(len(self._places), 1) / max(self._places[name], 1)
-        return self.chance(share, numbers)
+        return self.chance(share, numbers) + (rules.STAND_IN if name in rules.STAND_INS else 0.0)
 
     def chance(self, share: float, numbers: int) -> float:
         """Return the nats that noise alone reaches with a chance of `share`."""

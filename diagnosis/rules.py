@@ -8,6 +8,9 @@ Evidence is in nats: natural logarithms of likelihood ratios. `results/loop/rule
 FALSE_ALARM = 0.005
 # Chance that such a diagnosis finds something without a name.
 FALSE_DOUBT = 0.005
+# Nats that an effect must bring besides if it has a number of its own for every site: it does the work of many others.
+STAND_IN = 10.0
+STAND_INS = frozenset({"disorder"})
 # Nats besides for an influence that swings at a frequency of the motion itself, a multiple or a sum: a wrong equation
 # leaves just that. Where rounding makes the noise, it leaves lines at any frequency; a wrong equation that an input
 # drives leaves lines wherever the input has some.

@@ -360,12 +360,16 @@ class Search:
             for one in found[:2]:
                 model = fitted.model.without(number).with_effect(one.placed)
                 if model.key not in pool:
-                    other = self.exchanged(fitted, number, one.placed, fitted.cost)
+                    cheaper = self.problem.price_of(placed) - self.problem.price_of(one.placed)
+                    hope = fitted.cost + fitted.dispersion * max(cheaper, 0.0)
+                    other = self.exchanged(fitted, number, one.placed, hope)
                     if other is not None:
                         yield other
 
     def _rather(self, one: Scored, placed: Placed) -> bool:
         """Return whether a candidate is to be tried in the place of an effect."""
+        if len(one.placed.numbers) < len(placed.numbers):
+            return True
         # To first order; a candidate's gain is its share of what the effect does.
         return one.won * (1 - 1 / one.gain) / 2 + self.problem.price_of(placed) > 1 + self.problem.price_of(one.placed)
 
