@@ -86,6 +86,8 @@ class Normal:
         """
         scale, values, vectors = self._scaled
         held = values > UNDETERMINED
+        if not np.any(held):
+            return 1.0
         root = vectors[:, held] / np.sqrt(values[held]) / scale[:, None]
         size = self.inner[0].shape[1]
         own, left, ends = [], [], [0]

@@ -478,7 +478,7 @@ def test_what_an_experiment_would_have_carries_no_truth(clean):
     noisy = observe(clean["sine-gordon"], np.random.default_rng(0), noise=0.1)
     seen = noisy.observed()
     assert type(seen) is Samples
-    assert set(vars(seen)) == {"t", "u", "v", "f", "sigma", "source", "ends"}
+    assert set(vars(seen)) == {"t", "u", "v", "f", "sigma", "source", "ends", "origin"}
     assert seen.sigma is None
     for name in ("equation", "exact", "rate", "noise", "truth"):
         assert not hasattr(seen, name)
