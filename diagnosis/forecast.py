@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -82,8 +83,10 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
     if not held_out:
         near = _from(fitted, layout, early)
     layout = layout.with_substeps(model, near, other.top)
-    with np.errstate(all="ignore"):
-        again = fit(model, layout, near, structure=fitted.noise.structure, noise=fitted.noise, steps=max(steps, STEPS))
+    again, noise, most = None, fitted.noise, max(steps, STEPS)
+    # A model may be followed by all readings and run away by the early ones.
+    with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
+        again = fit(model, layout, near, structure=noise.structure, noise=noise, steps=most)
     if again is None:
         return [_lost(record.times[len(part.times) :], samples) for record, part, samples in
                 zip(other.records, early.records, other.data, strict=True)]  # fmt: skip
