@@ -14,6 +14,7 @@ import numpy as np
 
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
+from latticebench.diagnosis.border import MOST
 from latticebench.diagnosis.fitting import Fitted, fit
 from latticebench.diagnosis.horizon import Layout, unread
 from latticebench.diagnosis.model import Model
@@ -36,6 +37,9 @@ CLIMBING = 2
 SAME_COST, SAME_READING = 0.3, 0.05
 # An effect is tried without where its own uncertainty leaves less than so many nats beyond its price.
 DOUBT = 8.0
+# Derivatives of the states of one piece by the numbers of its border, at most: they grow as the square of its length.
+MOST_MOVES = 5e6
+
 # A candidate may take the place of an effect if it can do this share of what the effect does.
 MOST_OF_IT = 0.9
 # Sensors are tried from the other side on chains of so many sites at most.
@@ -139,12 +143,14 @@ class Search:
 
     @property
     def _longest(self) -> int:
-        """The rows of the longest pieces: whole recordings, or a few periods where noise comes in from the border."""
+        """The rows of the longest pieces: whole recordings, or some periods where the border has curves of its own."""
         longest = max(len(one.t) for one in self.problem.data)
         if not len(self.problem.plain.border):
             return longest
         period = 2 * np.pi / self.problem.main / self.problem.step
-        return min(longest, max(round(rules.BORDER * period), self._least))
+        plain = self.problem.plain
+        room = int(np.sqrt(MOST_MOVES / (MOST * len(plain.border) * plain.parts * plain.size)))
+        return min(longest, max(min(round(rules.BORDER * period), room), self._least))
 
     def _next(self, length: int, settled: bool) -> int:
         """Return the rows of the pieces of the next horizon; 0 after the longest."""
