@@ -58,7 +58,7 @@ class Normal:
 
     @functools.cached_property
     def _scaled(self) -> tuple[ndarray, ndarray, ndarray]:
-        scale = np.sqrt(np.maximum(np.diag(self.matrix), 1e-300))
+        scale = np.sqrt(np.maximum(np.diag(self.matrix), 1e-200))
         matrix = self.matrix / scale / scale[:, None]
         return scale, *np.linalg.eigh((matrix + matrix.T) / 2)
 
@@ -293,7 +293,7 @@ def fit(
     hope: float = np.inf,
     splines: Sequence[ndarray | None] | None = None,
 ) -> Fitted | None:
-    """Fit a model to pieces; None where it cannot be followed or there is no hope for it.
+    """Fit a model to pieces; None where it cannot be followed, overflows, or there is no hope for it.
 
     Args:
         model: with the numbers to start from.
@@ -330,6 +330,8 @@ def fit(
     solved = normal(layout, error, slope, followed.local, 0.0)
     dispersion = solved.dispersion()
     covariance = solved.covariance() * spread(error, robust, noise.tail) * dispersion
+    if not np.all(np.isfinite(covariance)):
+        return None
     return Fitted(layout, followed, noise, cost, covariance, dispersion, converged, rows)
 
 
