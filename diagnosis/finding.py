@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
-from latticebench.diagnosis.search import Search, wald
-from latticebench.diagnosis.worth import Worth
+from latticebench.diagnosis.search import Search
+from latticebench.diagnosis.worth import Worth, wald
 
 # An alternative that comes to no less than so many nats behind the effect is given up.
 HOPE = 30.0
@@ -113,7 +113,7 @@ def _rivals(search: Search, fitted: Fitted, without: Fitted | None, number: int,
     for one in search.standing_in(fitted, number)[:MOST_ALTERNATIVES]:
         names.add(one.placed.effect.name)
         hope = fitted.cost + HOPE * fitted.dispersion
-        found = search.exchanged(fitted, number, one.placed, hope)
+        found = search.exchanged(fitted, [number], one.placed, hope)
         if found is None:
             found = search.climbed(fitted.model.without(number).with_effect(one.placed), fitted, hope)
         if found is not None:

@@ -19,7 +19,7 @@ from latticebench.diagnosis.instrument import describe
 from latticebench.diagnosis.modes import Mode
 from latticebench.diagnosis.problem import Problem, derivative_share
 from latticebench.diagnosis.search import Found, Horizon, Search, Watcher
-from latticebench.diagnosis.unnamed import Left, left_in
+from latticebench.diagnosis.unnamed import Left, without_name
 from latticebench.diagnosis.worth import lost
 from latticebench.methods.method import check_fit
 from latticebench.systems.effects import Effect
@@ -157,13 +157,15 @@ def diagnose(
             if found is None:
                 raise InputError(f"{shown[0].source}: the declared equation cannot be followed even over a few samples")
             best = _named(search, found, foreseen)
+            search.say("looking for what has no name")
+            left = without_name(search, best.fitted)
         except KeyboardInterrupt:
             if found is None:
                 raise
             plain = Compared(found.models[0], (np.nan,) * len(found.models[0].model.effects), _none_equal(found))
-            raise Interrupted(_diagnosis(problem, found, plain, foreseen, recorded)) from None
+            raise Interrupted(_diagnosis(problem, found, plain, (), foreseen, recorded)) from None
         search.say("forecasting")
-        return _diagnosis(problem, found, best, foreseen, recorded)
+        return _diagnosis(problem, found, best, left, foreseen, recorded)
 
 
 def _none_equal(found: Found) -> tuple[tuple[str, ...], ...]:
@@ -206,13 +208,17 @@ def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Predi
 
 
 def _diagnosis(
-    problem: Problem, found: Found, best: Compared, foreseen: Callable[[Fitted], list[Prediction]], recorded: int
+    problem: Problem,
+    found: Found,
+    best: Compared,
+    left: tuple[Left, ...],
+    foreseen: Callable[[Fitted], list[Prediction]],
+    recorded: int,
 ) -> Diagnosis:
     """Return the diagnosis with the errors before and after."""
     before, after = found.before, best.fitted
     if not after.model.effects:
         before = after
-    left = left_in(after, problem)
     named = findings(best)
     noise = _noise(problem, after) if left else after.rms
     more = len(after.model.numbers) - len(before.model.numbers)

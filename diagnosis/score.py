@@ -7,8 +7,9 @@ integration (Rao's score test; nuisance parameters are projected out).
 
 from __future__ import annotations
 
+import copy
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -112,7 +113,13 @@ class Tangent:
             left.append((error - (local @ inner[:, :, -1:])[..., 0]).ravel())
         self.left, self.free = np.concatenate(left), np.concatenate(free)
         self.basis = _orthonormal(self.free)
-        self._kept: _Responses | None = None
+        whole = np.broadcast_to(fitted.rows.sensor, self.error.shape)
+        self._sensor = np.concatenate([one.ravel() for one in by_pieces(layout, whole)])
+        read = np.isfinite(followed.left)
+        self._read = np.concatenate([one.ravel() for one in by_pieces(layout, read)])
+        # Of the effects that it is in the place of: by how much the sum of squares grows without them.
+        self.taken = 0.0
+        self._kept: list[_Responses] = []
         self.courses: dict[tuple[int, str, bytes], ndarray] = {}
         self.terms: dict[tuple[int, str], ndarray] = {}
         self.evaluators: dict[tuple[int, tuple[int, int]], Callable[[Term], ndarray]] = {}
@@ -153,17 +160,33 @@ class Tangent:
 
     def scored(self, candidates: Sequence[Placed]) -> list[Scored]:
         """Return all candidates with what they would win."""
-        found: list[Scored] = []
+        return [one for batch in self.batches(candidates) for one in self.scored_at_once(batch)]
+
+    def batches(self, candidates: Sequence[Placed]) -> Iterator[list[Placed]]:
+        """Yield as many candidates as are worked on at a time, those that act on the motion first."""
         batch: list[Placed] = []
-        count = 0
-        for instrument in (False, True):
-            for one in candidates:
-                if one.instrument is instrument:
-                    batch.append(one)
-                    count += _columns_of(one)
-                if count * self.error.size > CHUNK:
-                    found, batch, count = found + self._scored(batch), [], 0
-        return found + (self._scored(batch) if batch else [])
+        for one in sorted(candidates, key=lambda one: one.instrument):
+            batch.append(one)
+            if sum(map(_columns_of, batch)) * self.error.size > CHUNK:
+                yield batch
+                batch = []
+        if batch:
+            yield batch
+
+    def in_place_of(self, numbers: Sequence[int]) -> Tangent:
+        """Return the tangent of a model without some effects of this one, what they did being left of the readings."""
+        model, kept = self.fitted.model, np.ones(self.free.shape[1], dtype=bool)
+        done = np.zeros(len(self.free))
+        for number in numbers:
+            block, strength = model.blocks[number], np.array(model.effects[number].strength)
+            kept[block] = False
+            done += self.free[:, block.start : block.start + len(strength)] @ strength
+        other = copy.copy(self)
+        other.__dict__.pop("_duals", None)
+        other.courses, other.basis = {}, _orthonormal(self.free[:, kept])
+        own = done - other.basis @ (other.basis.T @ done)
+        other.left, other.taken = self.left + own, float(own @ own)
+        return other
 
     def likeliest(
         self, candidates: Sequence[Placed], price: Callable[[Placed], float], kind: Callable[[Placed], object]
@@ -252,36 +275,19 @@ class Tangent:
         dual[:, 1:] += np.einsum("pjqns,pjks->pjqnk", along.late, carried[:, 1:], optimize=True)
         return dual.reshape(-1, count)
 
-    def standing_in(self, number: int, candidates: Sequence[Placed]) -> list[Scored]:
-        """Return candidates with the share of what one effect of the model does that they could do in its place.
-
-        The share takes the place of the gain; it is above 1 for what would do more. Their numbers are those with which
-        they do it.
-        """
-        placed, block = self.fitted.model.effects[number], self.fitted.model.blocks[number]
-        strength = slice(block.start, block.start + len(placed.strength))
-        others = np.delete(self.free, np.arange(block.start, block.stop), axis=1)
-        left, basis = self.left, self.basis
-        self.basis = _orthonormal(others)
-        done = self.free[:, strength] @ np.array(placed.strength)
-        own = done - self.basis @ (self.basis.T @ done)
-        whole = float(own @ own)
-        self.left = own + left
-        found = self.scored(candidates)
-        self.left, self.basis = left, basis
-        return [replace(one, gain=one.won / whole if whole > 0 else 0.0) for one in found]
-
-    def start(self, placed: Placed, dropped: int | None = None) -> tuple[Model, list[Float[ndarray, "pieces m state"]]]:
+    def start(
+        self, placed: Placed, dropped: Sequence[int] = ()
+    ) -> tuple[Model, list[Float[ndarray, "pieces m state"]]]:
         """Return a model with one more effect and states near its motion, to first order in the effect's strengths.
 
         Args:
             placed: the effect with its numbers.
-            dropped: the number of an effect of the model that it takes the place of.
+            dropped: the numbers of those effects of the model that it takes the place of.
         """
         model, layout = self.fitted.model, self.fitted.layout
         change, kept = np.zeros(self.free.shape[1]), np.ones(self.free.shape[1], dtype=bool)
-        if dropped is not None:
-            block, gone = model.blocks[dropped], model.effects[dropped].strength
+        for number in dropped:
+            block, gone = model.blocks[number], model.effects[number].strength
             kept[block] = False
             change[block.start : block.start + len(gone)] = -np.array(gone)
         own = np.concatenate([placed.strength, np.zeros(len(placed.shape))]) if len(placed.numbers) else np.ones(1)
@@ -301,7 +307,9 @@ class Tangent:
             if not placed.instrument:
                 near[-1] += (own @ self._moved(number, [placed])).reshape(nodes.shape)
         moved = model.moved(model.numbers + change)
-        return (moved if dropped is None else moved.without(dropped)).with_effect(placed), near
+        for number in sorted(dropped, reverse=True):
+            moved = moved.without(number)
+        return moved.with_effect(placed), near
 
     def _whitened(self, batch: Sequence[Placed]) -> ndarray:
         flat = np.concatenate([self._columns(k, batch) for k in range(len(self.along))])
@@ -310,14 +318,15 @@ class Tangent:
     def _responses(self, batch: Sequence[Placed]) -> _Responses:
         """Return what numbers of effects do to the readings; those of the last candidates are kept."""
         known = tuple(id(one) for one in batch)
-        if self._kept is None or self._kept.of != known:
+        if not self._kept or self._kept[0].of != known:
             flat = self._whitened(batch)
             whole = np.linalg.norm(flat.reshape(-1, flat.shape[-1]), axis=0)
             columns = self._moving_on(by_pieces(self.fitted.layout, flat))
             # What overflows along the motion wins nothing.
             sound = np.isfinite(whole) & np.isfinite(columns).all(axis=0)
-            self._kept = _Responses(known, np.where(sound, whole, 0.0), np.where(sound, columns, 0.0))
-        return self._kept
+            # In the list that tangents in the place of effects share.
+            self._kept[:] = [_Responses(known, np.where(sound, whole, 0.0), np.where(sound, columns, 0.0))]
+        return self._kept[0]
 
     def _moving_on(self, pieces: Sequence[ndarray]) -> ndarray:
         """Return what columns do to the readings that initial states cannot do."""
@@ -330,30 +339,49 @@ class Tangent:
         new = self._moving_on(pieces)
         return np.asarray(new - self.basis @ (self.basis.T @ new))
 
-    def _scored(self, batch: Sequence[Placed]) -> list[Scored]:
+    def scored_at_once(self, batch: Sequence[Placed]) -> list[Scored]:
+        """Return a few candidates with what they would win."""
         seen = self._responses(batch)
         unit = np.where(seen.whole > 0, seen.whole, 1.0)
         shared = (self.basis.T @ seen.columns) / unit
         slopes = (seen.columns.T @ self.left) / unit - shared.T @ (self.basis.T @ self.left)
         found, begin = [], 0
-        for one in batch:
+        does = np.zeros((len(self.left), len(batch)))
+        can = np.zeros((self.basis.shape[1], len(batch)))
+        for k, one in enumerate(batch):
             block = slice(begin, begin + _columns_of(one))
             begin = block.stop
             part = seen.columns[:, block] / unit[block]
             curved = part.T @ part - shared[:, block].T @ shared[:, block]
             if not len(one.numbers):
-                won = float((2 * slopes[block] * unit[block] - np.diag(curved) * unit[block] ** 2)[0])
-                found.append(Scored(one, self._gain(won), 1, won))
-                continue
-            values, vectors = np.linalg.eigh(curved)
-            held = values > OLD**2
-            projected = vectors[:, held].T @ slopes[block]
-            numbers = (vectors[:, held] @ (projected / values[held])) / unit[block]
-            won = float(np.sum(projected**2 / values[held]))
-            if one.effect.takes and numbers[0] > 0:
-                won = 0.0
-            found.append(Scored(one.moved(one.numbers + numbers), self._gain(won), int(np.sum(held)), won))
-        return found
+                numbers, freedom = unit[block], 1
+                won = float((2 * slopes[block] * numbers - np.diag(curved) * numbers**2)[0])
+            else:
+                values, vectors = np.linalg.eigh(curved)
+                held = values > OLD**2
+                projected = vectors[:, held].T @ slopes[block]
+                numbers, freedom = vectors[:, held] @ (projected / values[held]), int(np.sum(held))
+                won = float(np.sum(projected**2 / values[held]))
+                if one.effect.takes and numbers[0] > 0:
+                    won, numbers = 0.0, 0 * numbers
+                one = one.moved(one.numbers + numbers / unit[block])
+            does[:, k], can[:, k] = part @ numbers, shared[:, block] @ numbers
+            found.append(Scored(one, 0.0, freedom, won))
+        gains = self._gains(does - self.basis @ can)
+        return [replace(one, gain=value if one.won > 0 else 0.0) for one, value in zip(found, gains, strict=True)]
+
+    def _gains(self, does: Float[ndarray, "readings candidates"]) -> list[float]:
+        """Return the nats that candidates win which do so much to the readings, the size of the noise being free."""
+        alike = not self.fitted.noise.structure.own_sizes
+        sensor = np.zeros_like(self._sensor) if alike else self._sensor
+        gains = np.zeros(does.shape[1])
+        for number in range(int(np.max(sensor)) + 1):
+            here = sensor == number
+            count, total = float(np.sum(self._read[here])), float(np.sum(self.left[here] ** 2))
+            least = max(total, 1e-12 * count)
+            after = np.sum((self.left[here, None] - does[here]) ** 2, axis=0)
+            gains -= 0.5 * count * np.log(np.maximum(after / least, 1e-6)) if count else 0.0
+        return [float(one) for one in gains]
 
     def _gain(self, won: float) -> float:
         """Return the nats that so much of the sum of squares is worth, the size of the noise being free."""

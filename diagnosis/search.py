@@ -7,7 +7,8 @@ horizon.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure, estimate
 from latticebench.diagnosis.problem import Problem, regressed, turned
 from latticebench.diagnosis.score import Scored, Tangent
-from latticebench.diagnosis.worth import COUPLING, Worth, beyond, misfits, repelling
+from latticebench.diagnosis.worth import COUPLING, Worth, beyond, lost, misfits, repelling, same, wald
 
 Watcher = Callable[[str], None]
 
@@ -33,8 +34,6 @@ SMALL_SHARE, SMALL_NOISE = 1e-3, 0.1
 FIRST, CARRIED, CHANGED = 40, 25, 10
 # A model that cannot be followed over long pieces at once begins on the second horizon and climbs so many at a time.
 CLIMBING = 2
-# Models whose costs and readings differ by less (nats; share of the noise) are one model said in two ways.
-SAME_COST, SAME_READING = 0.3, 0.05
 # An effect is tried without where its own uncertainty leaves less than so many nats beyond its price.
 DOUBT = 8.0
 # Derivatives of the states of one piece by the numbers of its border, at most: they grow as the square of its length.
@@ -116,6 +115,8 @@ class Search:
         last: Found | None = None
         shortest = 2 * np.pi / self.problem.top / self.problem.step
         length = max(int(rules.FIRST_HORIZON * shortest), self._least)
+        if self._at_once():
+            length = self._longest
         while length:
             self.lengths.append(length)
             whole = length >= self._longest
@@ -135,6 +136,21 @@ class Search:
             last = Found(before, tuple(best), done)
             yield last
             length = self._next(length, settled)
+
+    def _at_once(self) -> bool:
+        """Return whether the declared equation alone follows the longest pieces: there is no need for short ones."""
+        found = self._begun(self._declared, self.problem, self.layout(self._longest), CHANGED)
+        return found is not None and found.converged and not lost(self.problem, found)
+
+    @functools.cached_property
+    def _declared(self) -> Model:
+        """The declared equation, with the numbers that a regression gives it."""
+        return Model(self.problem.declared, self.problem.order, regressed(self.problem))
+
+    def _begun(self, model: Model, seen: Problem, layout: Layout, steps: int = FIRST) -> Fitted | None:
+        """Return the first fit of a model, from smoothed readings as they are seen."""
+        near = [nodes[rows] for nodes, rows in zip(seen.nodes, layout.rows, strict=True)]
+        return self.refit(model, layout.with_substeps(model, near, self.problem.top), near, None, steps)
 
     @property
     def _least(self) -> int:
@@ -169,16 +185,14 @@ class Search:
         """Return the declared equation, and the rivals that begin the search."""
         problem = self.problem
         layout = self.layout(length)
-        start = Model(problem.declared, problem.order, regressed(problem))
+        start = self._declared
         still = replace(start, coefficients=(0.0,) * len(start.coefficients))
         fits: list[Fitted] = []
         at_once = [(start.with_effect(one), problem) for one in problem.candidates if one.from_the_start]
         for model, seen in ((start, problem), (still, problem), *at_once, *self._mirrored(start)):
             if model is still and fits:
                 continue
-            near = [nodes[rows] for nodes, rows in zip(seen.nodes, layout.rows, strict=True)]
-            ready = layout.with_substeps(model, near, problem.top)
-            found = self.refit(model, ready, near, None, FIRST)
+            found = self._begun(model, seen, layout)
             fits += [found] if found is not None else []
         if not fits:
             return []
@@ -368,7 +382,7 @@ class Search:
                 if model.key not in pool:
                     cheaper = self.problem.price_of(placed) - self.problem.price_of(one.placed)
                     hope = fitted.cost + fitted.dispersion * max(cheaper, 0.0)
-                    other = self.exchanged(fitted, number, one.placed, hope)
+                    other = self.exchanged(fitted, [number], one.placed, hope)
                     if other is not None:
                         yield other
 
@@ -376,8 +390,7 @@ class Search:
         """Return whether a candidate is to be tried in the place of an effect."""
         if len(one.placed.numbers) < len(placed.numbers):
             return True
-        # To first order; a candidate's gain is its share of what the effect does.
-        return one.won * (1 - 1 / one.gain) / 2 + self.problem.price_of(placed) > 1 + self.problem.price_of(one.placed)
+        return one.gain + self.problem.price_of(placed) > 1 + self.problem.price_of(one.placed)
 
     def _sure(self, fitted: Fitted, number: int) -> bool:
         """Return whether an effect is beyond doubt by its numbers and their covariance."""
@@ -395,15 +408,15 @@ class Search:
         weaker = numbers.copy()
         weaker[: len(placed.strength)] *= 0.1
         for start in (numbers, weaker) if len(placed.strength) else (numbers,):
-            model, near = self._tangent(fitted).start(placed.moved(start))
+            model, near = self.tangent(fitted).start(placed.moved(start))
             found = self.refit(model, fitted.layout, near, fitted, CHANGED, fitted.cost)
             if found is not None:
                 return found
         return None
 
-    def exchanged(self, fitted: Fitted, number: int, placed: Placed, hope: float) -> Fitted | None:
-        """Return the fit with another effect in the place of one; None where it comes to no cost below `hope`."""
-        model, near = self._tangent(fitted).start(placed, number)
+    def exchanged(self, fitted: Fitted, numbers: Sequence[int], placed: Placed, hope: float) -> Fitted | None:
+        """Return the fit with another effect in the place of some; None where it comes to no cost below `hope`."""
+        model, near = self.tangent(fitted).start(placed, numbers)
         return self.refit(model, fitted.layout, near, fitted, CHANGED, hope)
 
     def climbed(self, model: Model, fitted: Fitted, hope: float) -> Fitted | None:
@@ -423,20 +436,24 @@ class Search:
         return None if found is None else self.carry(found, fitted.layout, hope=hope)
 
     def standing_in(self, fitted: Fitted, number: int) -> list[Scored]:
-        """Return candidates that could do most of what one effect does, one of each name, the best first."""
+        """Return candidates that could do most of what one effect does, one of each name, the best first.
+
+        Their gain is by how many nats they would do better.
+        """
         placed = fitted.model.effects[number]
         if not placed.strength or placed.timed:
             return []
         present = {one.place for one in fitted.model.effects}
         absent = [one for one in self.open if one.place not in present and not one.timed]
-        ranked = sorted(self._tangent(fitted).standing_in(number, absent), key=lambda one: -one.gain)
+        tangent = self.tangent(fitted).in_place_of([number])
         best: dict[tuple[object, ...], Scored] = {}
-        for one in ranked:
-            if one.gain > MOST_OF_IT:
-                best.setdefault((one.placed.effect.name, len(one.placed.strength)), one)
+        for one in sorted(tangent.scored(absent), key=lambda one: -one.won):
+            if one.won > MOST_OF_IT * tangent.taken > 0:
+                better = replace(one, gain=(one.won - tangent.taken) / 2)
+                best.setdefault((one.placed.effect.name, len(one.placed.strength)), better)
         return list(best.values())
 
-    def _tangent(self, fitted: Fitted) -> Tangent:
+    def tangent(self, fitted: Fitted) -> Tangent:
         """Return the tangent of a fit; that of the last one is kept."""
         if self._last is None or self._last.fitted is not fitted:
             self._last = Tangent(fitted)
@@ -446,7 +463,7 @@ class Search:
         """Return the candidates whose score is above their price, the best first."""
         present = {one.place for one in fitted.model.effects if not one.timed}
         absent = [one for one in self.open if one.place not in present and not one.timed]
-        tangent, own = self._tangent(fitted), Worth(self.problem, fitted)
+        tangent, own = self.tangent(fitted), Worth(self.problem, fitted)
         if timed:
             courses = [one for one in self.open if one.timed]
             absent += tangent.likeliest(courses, self.problem.price_of, lambda one: one.effect.name)
@@ -463,28 +480,6 @@ class Search:
                 best[key] = (one.gain - price, one)
         self.tried[fitted.model.key] = tuple(sorted(tried.values(), key=lambda one: one.price - one.gain))
         return [one for _, one in sorted(best.values(), key=lambda pair: -pair[0])]
-
-
-def wald(fitted: Fitted, number: int) -> float:
-    """Return the nats that an effect brings as far as the model is linear: half of Wald's statistic.
-
-    What has no strengths is beyond all doubt.
-    """
-    strength = np.array(fitted.model.effects[number].strength)
-    begin = fitted.model.blocks[number].start
-    kept = slice(begin, begin + len(strength))
-    if not len(strength):
-        return float("inf")
-    return float(strength @ np.linalg.pinv(fitted.covariance[kept, kept]) @ strength) / 2
-
-
-def same(one: Fitted, other: Fitted) -> bool:
-    """Return whether two fits say the same of the readings."""
-    levels = one.followed.level, other.followed.level
-    if abs(one.cost - other.cost) > SAME_COST or levels[0].shape != levels[1].shape:
-        return False
-    size = other.noise.deviation()[other.rows.sensor]
-    return float(np.sqrt(np.nanmean(((levels[0] - levels[1]) / size) ** 2))) < SAME_READING
 
 
 def _names(model: Model) -> tuple[str, ...]:

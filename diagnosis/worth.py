@@ -14,6 +14,8 @@ from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.problem import Problem
 
 COUPLING = "u[n+1]+u[n-1]-2*u[n]"
+# Models whose costs and readings differ by less (nats; share of the noise) are one model said in two ways.
+SAME_COST, SAME_READING = 0.3, 0.05
 
 
 def beyond(problem: Problem, fitted: Fitted) -> float:
@@ -46,6 +48,28 @@ def repelling(problem: Problem, model: Model) -> float:
         return 0.0
     pairs = zip(model.declared.texts, model.coefficients, strict=True)
     return rules.REPELLING if any(text == COUPLING and value < 0 for text, value in pairs) else 0.0
+
+
+def wald(fitted: Fitted, number: int) -> float:
+    """Return the nats that an effect brings as far as the model is linear: half of Wald's statistic.
+
+    What has no strengths is beyond all doubt.
+    """
+    strength = np.array(fitted.model.effects[number].strength)
+    begin = fitted.model.blocks[number].start
+    kept = slice(begin, begin + len(strength))
+    if not len(strength):
+        return float("inf")
+    return float(strength @ np.linalg.pinv(fitted.covariance[kept, kept]) @ strength) / 2
+
+
+def same(one: Fitted, other: Fitted) -> bool:
+    """Return whether two fits say the same of the readings."""
+    levels = one.followed.level, other.followed.level
+    if abs(one.cost - other.cost) > SAME_COST or levels[0].shape != levels[1].shape:
+        return False
+    size = other.noise.deviation()[other.rows.sensor]
+    return float(np.sqrt(np.nanmean(((levels[0] - levels[1]) / size) ** 2))) < SAME_READING
 
 
 @dataclass(frozen=True, eq=False)

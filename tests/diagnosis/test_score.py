@@ -109,10 +109,11 @@ def test_an_effect_that_does_the_work_of_another_takes_its_place(problem, plain)
     damped = fitted(problem, 100, plain.model.with_effect(scored.placed), list(plain.followed.nodes))
     tangent = Tangent(damped)
     others = [candidate(problem, name) for name in ("quadratic-drag", "dry-friction", "onsite-cubic")]
-    share = {one.placed.effect.name: one.gain for one in tangent.standing_in(0, others)}
+    without = tangent.in_place_of([0])
+    found = {one.placed.effect.name: one for one in without.scored(others)}
+    share = {name: one.won / without.taken for name, one in found.items()}
     assert share["quadratic-drag"] > 0.8 > 0.3 > share["onsite-cubic"]
-    drag = next(one.placed for one in tangent.standing_in(0, others) if one.placed.effect.name == "quadratic-drag")
-    model, near = tangent.start(drag, 0)
+    model, near = tangent.start(found["quadratic-drag"].placed, [0])
     assert [one.effect.name for one in model.effects] == ["quadratic-drag"]
     begun = follow(model, damped.layout, near)
     assert begun is not None

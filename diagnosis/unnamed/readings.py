@@ -1,0 +1,200 @@
+"""Errors of instruments without a name: what a sensor adds to its reading, and what all of them have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from latticebench.diagnosis.acting import Chain, Misreading, Placed, Scene
+from latticebench.diagnosis.unnamed.course import Course, courses, growing
+from latticebench.systems.effects import Effect
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+    from latticebench.diagnosis.problem import Problem
+
+# Fringes of a cyclic error over the largest reading; shares of it beyond which readings are clipped; numbers of courses
+# in time.
+FRINGES, CLIPPED, COURSES = (1, 2, 4, 8, 16), (0.5, 0.7, 0.85), (8, 32, 64)
+
+Reading = Callable[["ndarray", "ndarray"], tuple["ndarray", "ndarray | float"]]
+"""From times (rows,) and a field (rows, levels, parts, N) to what is added to the reading per unit of a strength, and
+its derivative by the reading's own field."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Misread(Placed):
+    """A sum of errors of the readings, each with a strength.
+
+    Attributes:
+        said: in words.
+        added: what each adds.
+        here: the only sensor's site, from 0; None where there is no such site.
+        both: whether the velocity is that of the wrong reading, too.
+    """
+
+    said: str
+    added: tuple[Reading, ...]
+    here: int | None = None
+    both: bool = False
+    instrument: ClassVar[bool] = True
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:  # noqa: ARG003
+        """Return nothing: it is in no catalogue."""
+        return iter(())
+
+    @property
+    def site(self) -> int | None:
+        """The only site, from 0."""
+        return self.here
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """What it is, and where."""
+        return (self.said, self.here, self.both)
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
+        """Return what it is."""
+        return tuple(self.said for _ in self.added)
+
+    def misread(self, t: ndarray, field: ndarray) -> Misreading:
+        """Return what the errors add."""
+        sites = slice(None) if self.here is None else self.here
+        levels = slice(None) if self.both else slice(0, 1)
+        by, slope = np.zeros((len(self.added), *field.shape)), np.zeros_like(field)
+        for k, (one, strength) in enumerate(zip(self.added, self.strength, strict=True)):
+            added, own = one(t, field)
+            by[k, :, levels, :, sites] = np.broadcast_to(added, field.shape)[:, levels, :, sites]
+            slope[:, levels, :, sites] += strength * np.broadcast_to(own, field.shape)[:, levels, :, sites]
+        return Misreading(np.tensordot(self.strength, by, 1), slope, by)
+
+
+def readings(problem: Problem) -> Iterator[Misread]:
+    """Yield errors of single sensors, of all in common, and between sensors."""
+    chain = problem.chain
+    grows = _in_time(growing(problem.scene))
+    for here in range(chain.sites):
+        yield _misread("a zero that drifts", [_of_part(grows, k) for k in range(chain.parts)], here)
+        yield _misread("a gain that drifts", [_times(grows)], here)
+        if chain.levels > 1:
+            yield _misread("a reading that lags", [_rate], here)
+    if chain.levels > 1:
+        yield _misread("readings that lag", [_rate])
+    yield from _between(problem)
+    largest = max(float(np.nanmax(np.abs(one.u))) for one in problem.data)
+    for count in FRINGES:
+        yield _misread(f"an error of {count} fringes", [_fringe(np.pi * count / largest, phase) for phase in (0, 1)])
+    yield _misread("readings clipped above", [_beyond(share * largest) for share in CLIPPED])
+    if chain.is_complex:
+        yield _misread("unequal gains of both parts", [_conjugate])
+    rows = max(len(one.t) for one in problem.data)
+    for number in sorted({min(one, rows // 2) for one in COURSES}):
+        if number >= COURSES[0]:
+            shared = [_in_time(one) for one in courses(problem.scene, number)]
+            zero = [_of_part(one, k) for one in shared for k in range(chain.parts)]
+            yield _misread("a zero of its own course in time, common to all sensors", zero)
+            yield _misread("a gain of its own course in time, common to all sensors", [_times(one) for one in shared])
+            if chain.levels > 1:
+                yield _misread("a clock of its own course in time", [_late(one) for one in shared])
+
+
+def _between(problem: Problem) -> Iterator[Misread]:
+    """Yield errors that sensors share with others: of neighbours, of the one before, of the mean, along the chain."""
+    chain = problem.chain
+    if chain.sites < 2:
+        return
+    place = (np.arange(chain.sites) - (chain.sites - 1) / 2) / ((chain.sites - 1) / 2)
+    for both in (False, True)[: chain.levels]:
+        yield _misread("readings that hold some of their neighbours'", [_neighbours], both=both)
+        yield _misread("readings that hold some of the one before", [_before], both=both)
+        yield _misread("readings against their mean", [_mean], both=both)
+        if chain.sites > 3:
+            yield _misread("gains that grow along the chain", [_scaled(place)], both=both)
+            yield _misread("another gain of one half", [_scaled((place > 0).astype(float))], both=both)
+    if chain.levels > 1 and chain.sites > 3:
+        yield _misread("readings one after the other", [_lagging(np.arange(chain.sites))])
+        grows, half = _in_time(growing(problem.scene)), (place > 0).astype(float)
+        yield _misread("another clock of one half", [lambda t, field: (grows(t) * half * field[:, -1:], 0.0)])
+
+
+def _misread(said: str, added: Sequence[Reading], here: int | None = None, *, both: bool = False) -> Misread:
+    return Misread(
+        effect=Effect("unnamed", "1"), said=said, added=tuple(added), here=here, both=both, strength=(0.0,) * len(added)
+    )  # fmt: skip
+
+
+def _in_time(course: Course) -> Callable[[ndarray], ndarray]:
+    """Return a course in time as a factor of fields."""
+    return lambda t: course(t)[0][:, None, None]
+
+
+def _of_part(course: Callable[[ndarray], ndarray], part: int) -> Reading:
+    def added(t: ndarray, field: ndarray) -> tuple[ndarray, float]:
+        return course(t) * (np.arange(field.shape[2]) == part)[:, None], 0.0
+
+    return added
+
+
+def _times(course: Callable[[ndarray], ndarray]) -> Reading:
+    return lambda t, field: (course(t) * field, course(t))
+
+
+def _late(course: Callable[[ndarray], ndarray]) -> Reading:
+    return lambda t, field: (course(t) * field[:, -1:], 0.0)
+
+
+def _scaled(factor: ndarray) -> Reading:
+    return lambda _, field: (factor * field, factor)
+
+
+def _lagging(factor: ndarray) -> Reading:
+    return lambda _, field: (-factor * field[:, -1:], 0.0)
+
+
+def _rate(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
+    return -field[:, -1:], 0.0
+
+
+def _neighbours(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
+    added = np.zeros_like(field)
+    added[..., 1:] += field[..., :-1]
+    added[..., :-1] += field[..., 1:]
+    return added, 0.0
+
+
+def _before(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
+    added = np.zeros_like(field)
+    added[..., 1:] = field[..., :-1]
+    return added, 0.0
+
+
+def _mean(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
+    return np.mean(field, axis=-1, keepdims=True), 1 / field.shape[-1]
+
+
+def _conjugate(t: ndarray, field: ndarray) -> tuple[ndarray, ndarray]:  # noqa: ARG001
+    sign = np.array([1.0, -1.0])[:, None]
+    return sign * field, sign
+
+
+def _fringe(angle: float, phase: int) -> Reading:
+    def added(_: ndarray, field: ndarray) -> tuple[ndarray, ndarray]:
+        turned = angle * field + phase * np.pi / 2
+        return np.sin(turned), angle * np.cos(turned)
+
+    return added
+
+
+def _beyond(level: float) -> Reading:
+    """Return by how much a field is beyond a level, to either side."""
+
+    def added(_: ndarray, field: ndarray) -> tuple[ndarray, ndarray]:
+        over = np.sign(field) * np.maximum(np.abs(field) - level, 0.0)
+        return over, (over != 0).astype(float)
+
+    return added
