@@ -20,10 +20,13 @@ from latticebench.bench.report.separation import Separation, separations
 from latticebench.bench.report.shown import Shown
 from latticebench.bench.report.units import Units, in_sentence, noise_in_words, units_of
 from latticebench.bench.report.whereabouts import Whereabouts, whereabouts
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.instrument import step_of
 from latticebench.methods.engine.dynamics import split_parts
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from latticebench.bench.overlay import Overlay
     from latticebench.diagnosis.acting import Chain
     from latticebench.diagnosis.fitting import Fitted
@@ -89,19 +92,22 @@ class Equations(Content):
 
 
 class Left(Content):
-    """Something that is significant in the last residual, though it was not named.
+    """Something without a name: significant in the last residual, or better than effects that were named.
 
     Attributes:
-        effect: its name, or what it is where it has none.
+        effect: what it is.
         site: where it acts (from 1), if at one site.
-        gain: natural logarithm of how much likelier it can make the readings, by a score test.
-        price: what chance alone may gain.
+        gain: natural logarithm of how much likelier it can make the readings, by a score test; in the place of effects,
+            by how many nats it is better.
+        price: what chance alone may gain, or by how many nats it must be better.
+        instead: the named effects in whose place it does better; none for what is in the residual.
     """
 
     effect: str
     site: int | None
     gain: Number
     price: Number
+    instead: tuple[str, ...] = ()
 
 
 class Report(Content):
@@ -167,7 +173,7 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
     size = abs(units.scale)
     sensors = [f"{letter}{site + 1}" for letter in "uv"[: chain.levels] for site in range(chain.sites)]
     return Report(
-        verdict=cast(Verdict, diagnosis.verdict), sentence=_sentence(diagnosis.verdict, found),
+        verdict=cast(Verdict, diagnosis.verdict), sentence=_sentence(diagnosis, found),
         recording=_recording(diagnosis),
         declared=after, declared_before=before, declared_stderr=after_errors, declared_stderr_before=before_errors,
         declared_truth=None if diagnosis.truth is None else dict(zip(after, map(float, diagnosis.truth), strict=True)),
@@ -180,7 +186,8 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
         modes=modes(diagnosis), horizons=horizons(diagnosis), error=_errors(diagnosis, size),
         where=Where(before=whereabouts(diagnosis.before, diagnosis), after=whereabouts(diagnosis.after, diagnosis)),
         left=tuple(
-            Left(effect=one.name, site=None if one.site is None else one.site + 1, gain=one.gain, price=one.price)
+            Left(effect=one.name, site=None if one.site is None else one.site + 1, gain=one.gain, price=one.price,
+                 instead=one.instead)
             for one in diagnosis.left
         ),
         notes=notes(diagnosis), interrupted=interrupted,
@@ -193,20 +200,35 @@ def diagnosis_document(report: Report, about: Provenance, overlay: Overlay | Non
     return DiagnosisDocument(provenance=about, shown=None if overlay is None else Shown.of(overlay), **said)
 
 
-def _sentence(verdict: str, found: tuple[AddedEffect, ...]) -> str:
-    """Return the verdict in one sentence."""
-    if verdict == "nothing missing":
+def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
+    """Return the verdict in words."""
+    if diagnosis.verdict == "nothing missing":
         return "Nothing is missing: what the equation leaves cannot be told from noise."
-    if verdict == "unexplained":
+    if diagnosis.verdict == "unexplained":
         return "Something is missing, but nothing in the catalogue explains it."
     names = [
         one.effect + (f" (or {', '.join(one.indistinguishable)})" if one.indistinguishable else "") for one in found
     ]
-    listed = " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
-    if verdict == "explained":
+    said = [f"What the equation lacks: {_listed(names)}."]
+    rivals = [one for one in diagnosis.left if one.instead]
+    if rivals:
+        best = rivals[0]
+        where = "" if best.site is None else f" at site {best.site + 1}"
+        said.append(
+            f"Something without a name, {best.name}{where}, does better in the place of {_listed(best.instead)}."
+        )
+    if len(rivals) < len(diagnosis.left):
+        said.append("Something more is left that nothing in the catalogue explains.")
+    elif not rivals:
         them = "it" if len(names) == 1 else "them"
-        return f"What the equation lacks: {listed}. With {them}, nothing significant is left."
-    return f"What the equation lacks: {listed}. Something more is left that nothing in the catalogue explains."
+        said.append(f"With {them}, nothing significant is left.")
+    if diagnosis.residual[1] > rules.LOST:
+        said.append(f"The model does not reach the readings: it leaves {diagnosis.residual[1]:.2g} times their noise.")
+    return " ".join(said)
+
+
+def _listed(names: Sequence[str], last: str = "and") -> str:
+    return f" {last} ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
 
 
 def _recording(diagnosis: Diagnosis) -> RecordingSummary:

@@ -44,7 +44,8 @@ def page(report: Report, curves: PictureCurves, about: Provenance | None = None)
     return templates.get_template("diagnosis.html.j2").render(
         report=report, curves=curves, style=style, pictures=pictures.draw(curves, [float(one) for one in frequencies]),
         effects=rows.effects(report), coefficients=rows.coefficients(report), errors=rows.errors(report),
-        modes=rows.modes(report), horizons=rows.horizons(report), left=rows.left(report), tried=_bars(report),
+        modes=rows.modes(report), horizons=rows.horizons(report), left=rows.left(report),
+        instead=rows.instead(report), tried=_bars(report),
         alternatives=rows.alternatives(report),
         interrupted=INTERRUPTED, scale=_scale(report, curves.residual.limit),
         swing=1 < report.recording.sites < pictures.MAPPED,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from latticebench.bench.report.content import Report
+from latticebench.bench.report.content import Left, Report
 from latticebench.bench.report.horizons import Candidate
 from latticebench.bench.report.modes import Mode
 from latticebench.bench.report.units import with_unit
@@ -143,8 +143,15 @@ def tried(report: Report) -> list[Candidate]:
 
 def left(report: Report) -> Table:
     """Return what is significant in the last residual."""
-    rows = [
-        [one.effect, "" if one.site is None else str(one.site), f"{one.gain:.1f}", f"{one.price:.1f}"]
-        for one in report.left
-    ]
+    rows = [[one.effect, _place(one), f"{one.gain:.1f}", f"{one.price:.1f}"] for one in report.left if not one.instead]
     return ["what", "site", "gain", "price"], rows
+
+
+def instead(report: Report) -> Table:
+    """Return what does better than effects that were named."""
+    rows = [[one.effect, _place(one), ", ".join(one.instead), f"{one.gain:.1f}"] for one in report.left if one.instead]
+    return ["what", "site", "in the place of", "better by"], rows
+
+
+def _place(one: Left) -> str:
+    return "" if one.site is None else str(one.site)

@@ -59,6 +59,7 @@ def _show_search(report: Report) -> None:
     candidates = [[one.effect, f"{one.gain:.1f}", f"{one.price:.1f}"] for one in rows.tried(report)]
     _show_table("What else was tried at last, in nats", (["effect", "gain", "price"], candidates))
     _show_table("What is left without a name, in nats", rows.left(report))
+    _show_table("What does better without a name, in nats", rows.instead(report))
 
 
 def _show_table(title: str, table: rows.Table) -> None:

@@ -138,12 +138,25 @@ def test_each_horizon_has_its_leading_model_and_how_far_rivals_were_behind(pendu
 
 
 def test_what_is_left_without_a_name_is_told_with_its_site(pendula: Made, capsys: pytest.CaptureFixture[str]) -> None:
-    left = SimpleNamespace(name="u[n]**4", gain=31.0, price=9.5, site=1)
+    left = SimpleNamespace(name="u[n]**4", gain=31.0, price=9.5, site=1, instead=())
     report = content(pendula(left=(left,), verdict="partly explained"))
     assert rows.left(report)[1] == [["u[n]**4", "2", "31.0", "9.5"]]
     assert "Something more is left" in report.sentence
     show(report)
     assert "u[n]**4" in capsys.readouterr().out
+
+
+def test_what_does_better_than_an_effect_in_its_place_is_said_so(
+    pendula: Made, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rival = SimpleNamespace(name="t*u[n]", gain=9.4, price=3.0, site=None, instead=("damping", "sensor-gain"))
+    report = content(pendula(left=(rival,), verdict="partly explained"))
+    assert rows.left(report)[1] == []
+    assert rows.instead(report)[1] == [["t*u[n]", "", "damping, sensor-gain", "9.4"]]
+    assert "without a name, t*u[n], does better in the place of damping and sensor-gain" in report.sentence
+    assert "more is left" not in report.sentence
+    show(report)
+    assert "better by" in capsys.readouterr().out
 
 
 def test_the_terminal_shows_equation_search_errors_and_what_would_separate(
