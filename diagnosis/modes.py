@@ -34,25 +34,27 @@ def of_recording(problem: Problem) -> tuple[Mode, ...]:
 
 
 def of_model(fitted: Fitted) -> tuple[Mode, ...]:
-    """Return the modes of a model linearised about the mean of its motion, those of lowest frequency first.
+    """Return the modes of a model linearised over the swing of its motion, those of lowest frequency first.
 
-    Forces that depend on time have no part in them. A pair of real eigenvalues has the frequency 0.
+    Its slopes are those between a standard deviation of the motion to either side of the mean, as a describing function
+    has them: the frequency of a pendulum is that of its swing, and dry friction, which jumps at rest, damps it. Forces
+    that depend on time have no part in them. A pair of real eigenvalues has the frequency 0.
     """
     layout = fitted.layout
     assembled = fitted.model.assembled(layout.plain, layout.chain)
     dynamics = assembled.dynamics
-    mean = np.mean(np.concatenate([one.reshape(-1, fitted.followed.size) for one in fitted.followed.nodes]), axis=0)
+    states = np.concatenate([one.reshape(-1, fitted.followed.size) for one in fitted.followed.nodes])
+    mean, size = np.mean(states, axis=0), float(np.sqrt(np.mean(states**2)))
     if dynamics.order == 2:
         mean[len(mean) // 2 :] = 0.0
-    # The sixth root of the rounding error is a good step for central differences of what is nearly a polynomial.
-    step = 1e-4 * float(np.sqrt(np.mean(fitted.followed.nodes[0] ** 2)) + 1e-300)
+    step = np.maximum(np.std(states, axis=0), 1e-4 * size + 1e-300)
     t = np.zeros(2 * len(mean))
-    around = np.concatenate([mean + step * np.eye(len(mean)), mean - step * np.eye(len(mean))])
+    around = np.concatenate([mean + np.diag(step), mean - np.diag(step)])
     driven = layout.records[0].stretches.driven(t + layout.records[0].times[0], layout.splines[0])
     f = None if layout.records[0].stretches.inputs is None else np.zeros((len(t), layout.chain.sites))
     with np.errstate(all="ignore"):
         rate = dynamics.linear(assembled.coefficients, t, around, f, driven, derivatives=False)[0]
-        matrix = ((rate[: len(mean)] - rate[len(mean) :]) / (2 * step)).T
+        matrix = ((rate[: len(mean)] - rate[len(mean) :]) / (2 * step[:, None])).T
     if not np.all(np.isfinite(matrix)):
         return ()
     values = np.linalg.eigvals(matrix)

@@ -38,14 +38,18 @@ EQUAL = 3.0
 PERIODS = 3.0
 # Horizons begin at this share of the shortest period, where a wrong equation can follow, too.
 FIRST_HORIZON = 0.5
+# Where the declared equation leaves less than so many times the noise of whole recordings, the search begins there:
+# what is missing is weak, and short horizons would only offer stand-ins.
+AT_ONCE = 1.5
 # Pieces grow so many times from one horizon to the next, and faster where that changed nothing; beyond this share of
 # the record they are the record.
 GROWTH, FASTER, ALMOST = 2, 4, 0.6
 # Periods of the longest pieces where the ends are unknown: the curves of the outer sites have numbers of their own in
 # each, so that work grows as the square of a piece's length.
 BORDER = 16.0
-# A residual beyond so many times the noise that the readings themselves show is not followed.
-LOST = 3.0
+# A residual beyond so many times the noise that the readings themselves show is not followed, unless it is less than
+# this share of the swing: no equation of a laboratory is right to the last digit of an encoder.
+LOST, FOLLOWED = 3.0, 0.01
 # Where even what is new from one reading to the next is beyond it, what is left is not noise, and nats say little: an
 # effect counts if it takes away this share of what is left (of its root mean square), an influence with a frequency or
 # a time of its own if it takes half of it: a misfit swings as the motion does.

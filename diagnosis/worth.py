@@ -25,11 +25,13 @@ def beyond(problem: Problem, fitted: Fitted) -> float:
 
 
 def lost(problem: Problem, fitted: Fitted) -> bool:
-    """Return whether a model leaves much more of the readings than their own noise, and more than noise.
+    """Return whether a model leaves a part of the motion: much more than the readings' own noise, and not a hundredth.
 
     Of correlated noise, and of outliers, readings alone show only a part.
     """
-    return beyond(problem, fitted) > rules.LOST and fitted.has_lines()
+    of_u = float(np.sqrt(np.nanmean(fitted.rms[: problem.chain.sites] ** 2)))
+    large = beyond(problem, fitted) > rules.LOST and of_u > rules.FOLLOWED * problem.height
+    return large and fitted.has_lines()
 
 
 def misfits(problem: Problem, fitted: Fitted) -> bool:
