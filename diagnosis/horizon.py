@@ -483,8 +483,8 @@ def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
         by = np.moveaxis(layout.plain.whole(flat, None)[:, :, : layout.chain.levels], 1, -1)
         border = layout.borders[number]
         if border is not None:
-            t = layout.records[number].times[rows]
-            border.add_readings(by[..., size : size + border.size], t, layout.plain.border)
+            times = layout.records[number].times[rows]
+            border.add_readings(by[..., size : size + border.size], times, layout.plain.border)
         by = by.reshape(rows.size, -1, count) * path.own[begin : begin + rows.size, :, None]
         begin += rows.size
         for placed, block in path.model.instruments():

@@ -17,6 +17,9 @@ from latticebench.diagnosis.unnamed import forces, readings
 # What could do better than named effects is fitted in full: the likeliest ones, so many of each set of effects. Sets of
 # so many are looked at, and all together.
 TRIED, OF_EACH, MOST = 5, 2, 2
+# Scores are linear: what they say is worse by no more than so many nats, and this share of what the effects bring, may
+# be better.
+SLACK, INEXACT = 10.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,8 @@ def without_name(search: Search, fitted: Fitted) -> tuple[Left, ...]:
     for number, one, price in unnamed.scored(tangents):
         if number:
             found = _Instead.of(search, fitted, sets[number - 1], tangents[number].taken, one, price)
-            instead.setdefault(found.numbers, []).append(found)
+            if found.worse < SLACK + INEXACT * tangents[number].taken / 2:
+                instead.setdefault(found.numbers, []).append(found)
         elif one.gain > price:
             left.append(Left(_said(one.placed), one.gain, price, one.placed.site))
     likely = [one for found in instead.values() for one in sorted(found, key=lambda one: one.worse)[:OF_EACH]]

@@ -24,17 +24,16 @@ def courses(scene: Scene, count: int) -> list[Course]:
     """Return B-splines whose sums are smooth courses with `count` numbers over the longest recording."""
     basis = BSplines.clamped(np.linspace(scene.begin, scene.begin + scene.span, count - DEGREE + 1), DEGREE)
 
-    def one(number: int) -> Course:
-        def course(t: ndarray) -> ndarray:
-            first, values, _ = basis.basis(np.clip(t, scene.begin, scene.begin + scene.span))
-            own = number - first
-            inside = (own >= 0) & (own <= DEGREE)
-            found = np.where(inside, values[np.arange(len(t)), np.clip(own, 0, DEGREE)], 0.0)
-            return np.asarray(found[None, :, None])
+    known: list[tuple[ndarray, ndarray]] = []
 
-        return course
+    def design(t: ndarray) -> ndarray:
+        # All courses are asked for the same times, one after the other.
+        if not known or not np.array_equal(known[0][0], t):
+            within = np.clip(t, scene.begin, scene.begin + scene.span)
+            known[:] = [(t.copy(), basis.design(within, 0).T)]
+        return known[0][1]
 
-    return [one(number) for number in range(basis.count)]
+    return [lambda t, number=number: design(t)[number][None, :, None] for number in range(basis.count)]  # type: ignore[misc]
 
 
 def growing(scene: Scene) -> Course:
