@@ -105,8 +105,8 @@ def test_an_effect_that_stands_in_for_what_has_no_name_is_doubted():
 
 
 def test_a_weak_bond_is_found_where_it_is():
-    weak = chain(lambda t, u, v: 0.05 * np.array([0.0, u[1] - u[2], u[2] - u[1], 0.0]))
-    found = diagnosed(weak, ("drive",))
+    weak = chain(lambda t, u, v: 0.02 * np.array([0.0, u[1] - u[2], u[2] - u[1], 0.0]))
+    found = diagnosed(weak, ("dry-friction",))
     assert found.verdict == "unexplained"
     assert (found.left[0].name, found.left[0].site) == ("the bond to site 3", 1)
 
