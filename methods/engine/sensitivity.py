@@ -38,6 +38,8 @@ CHUNK = 200_000
 MAX_SUBSTEPS = 256
 # The largest share of a disturbance that may be left beyond its reach.
 TAIL = 1e-9
+# Where terms read more places than this of each part, all sites are taken to couple: one product of matrices is faster.
+WIDE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,17 +337,30 @@ class Stretches:
                     column = columns - extra + (place * parts + part) * len(border) + number
                     for level in range(order):
                         field[column, level, part, site, rows] = curves[level]
-        padded = dynamics.stencil.pad(field, after=1)
         target = out.reshape(columns, order, parts, count, len(t))
         if order == 2:
             target[:, 0] = blocks[:, 1]
         target[:, -1] = 0.0
-        for (part, slot), slope in slopes.items():
-            window = padded[(slice(None), *slot.place, *dynamics.stencil.window(slot.vector))]
-            target[:, -1, part] += (np.atleast_2d(slope).T if np.ndim(slope) else slope) * window
+        if len(slopes) > WIDE * parts**2 and not len(dynamics.border):
+            product = self._jacobian(slopes, len(t)) @ np.transpose(z, (2, 1, 0))
+            target[:, -1] = np.transpose(product, (2, 1, 0)).reshape(target[:, -1].shape)
+        else:
+            padded = dynamics.stencil.pad(field, after=1)
+            for (part, slot), slope in slopes.items():
+                window = padded[(slice(None), *slot.place, *dynamics.stencil.window(slot.vector))]
+                target[:, -1, part] += (np.atleast_2d(slope).T if np.ndim(slope) else slope) * window
         if by_terms:
             own = columns - extra - terms
             target[own : own + terms, -1] += np.transpose(values, (1, 0, 3, 2))
+
+    def _jacobian(self, slopes: dict[tuple[int, Slot], ndarray], batch: int) -> Float[ndarray, "batch rate state"]:
+        """Return the derivatives of the highest rates (parts and sites) by the states, for sites that couple to many."""
+        dynamics, sites = self.dynamics, np.arange(self.dynamics.count)
+        found = np.zeros((batch, dynamics.parts, dynamics.count, dynamics.order, dynamics.parts, dynamics.count))
+        for (part, slot), slope in slopes.items():
+            place, factor = dynamics.stencil.neighbours(slot.vector)
+            found[:, part, sites, slot.place[0], slot.place[1], place] += slope * factor
+        return found.reshape(batch, dynamics.parts * dynamics.count, dynamics.size)
 
     @functools.cached_property
     def _tableau(self) -> tuple[ndarray, ndarray, ndarray]:

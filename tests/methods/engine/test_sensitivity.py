@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench import systems
+from latticebench.methods.engine import sensitivity
 from latticebench.methods.engine.dynamics import Dynamics
 from latticebench.methods.engine.sensitivity import Stretches
 from latticebench.systems.simulate import simulate
@@ -237,6 +238,20 @@ def test_long_chains_are_disturbed_in_groups_with_the_same_result():
     assert isinstance(grouped.by_state, list)
     whole = stretches.vary_in_groups(truth, nodes, np.array([1]), None, 40, 40)
     np.testing.assert_allclose(grouped.by_state[0].toarray(), whole.by_state[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("ends", ["free", "fixed", "periodic"])
+def test_where_nearly_all_sites_couple_a_product_of_matrices_gives_the_same_derivatives(ends, monkeypatch):
+    texts = [f"i*(u[n+{r}]+u[n-{r}]-2*u[n])" for r in range(1, 8)] + ["i*abs(u[n])**2*u[n]"]
+    dynamics = Dynamics(tuple(map(Term, texts)), 1, True, 9, ends)
+    draw = np.random.default_rng(4)
+    one = Stretches(dynamics, np.array([0.0, 0.1]), np.array([0.1, 0.2]))
+    arguments = draw.normal(size=len(texts)), draw.normal(size=(2, dynamics.size)), np.array([1, 2])
+    found = one.vary(*arguments)
+    monkeypatch.setattr(sensitivity, "WIDE", np.inf)
+    by_windows = one.vary(*arguments)
+    np.testing.assert_allclose(found.by_state, by_windows.by_state, atol=1e-12)
+    np.testing.assert_allclose(found.by_coefficient, by_windows.by_coefficient, atol=1e-12)
 
 
 # Dry friction ---------------------------------------------------------------------------------------------------------
