@@ -1,4 +1,4 @@
-"""The axes of a block of a suite file: lists (a single value stands for a list of one) and ranges of seeds."""
+"""The axes of a block of a suite file: lists (a single value stands for a list of one), and seeds with their ranges."""
 
 from __future__ import annotations
 
@@ -21,14 +21,31 @@ def _listed(value: Any) -> Any:
 
 
 def _seeds(value: Any) -> Any:
-    """Read "1-100" as the seeds from 1 to 100."""
+    """Read "1-100" as the seeds from 1 to 100, and "1,3,7" as these three."""
     if not isinstance(value, str):
         return _listed(value)
-    found = re.fullmatch(r"\s*(\d{1,9})\s*-\s*(\d{1,9})\s*", value)
-    if found is None or not 0 <= int(found[2]) - int(found[1]) < MOST_SEEDS:
-        raise ValueError(f'write a range of at most {MOST_SEEDS} seeds as "1-100", the smaller one first')
-    return list(range(int(found[1]), int(found[2]) + 1))
+    found: list[int] = []
+    for part in value.split(","):
+        ends = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", part)
+        first, last = (0, -1) if ends is None else (int(ends[1]), int(ends[2] or ends[1]))
+        if last < first or last - first + len(found) >= MOST_SEEDS:
+            raise ValueError(f'write at most {MOST_SEEDS} seeds as "1-100", the smaller one first, or as "1,3,7"')
+        found += range(first, last + 1)
+    return found
 
 
 Listed = Annotated[list[T], pydantic.BeforeValidator(_listed)]
 Seeds = Annotated[list[Seed], pydantic.BeforeValidator(_seeds)]
+_SEEDS = pydantic.TypeAdapter(Seeds)
+
+
+def read_seeds(value: Any) -> list[int]:
+    """Return seeds from a text such as "1-100" or "1,3,7", or from a list of them.
+
+    Raises:
+        ValueError: they are no seeds.
+    """
+    try:
+        return _SEEDS.validate_python(value)
+    except pydantic.ValidationError as error:
+        raise ValueError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None

@@ -61,10 +61,17 @@ class Folders:
     Attributes:
         suite: the folder of the suite file, for a user's own methods and systems.
         data: the folder of measured recordings.
+        chosen: for methods, where it is another one than that of the suite file.
     """
 
     suite: Path = Path()
     data: Path = DATA
+    chosen: Path | None = None
+
+    @property
+    def methods(self) -> Path:
+        """Where paths of a user's own methods start from."""
+        return self.suite if self.chosen is None else self.chosen
 
 
 @dataclass(frozen=True)

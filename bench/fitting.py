@@ -115,7 +115,7 @@ class FitCase(Case):
         """Fit, and score the fit against the truth; see `Case.run`."""
         base = folders.suite
         system, candidates = self.resolve(base)
-        method = make(methods.find(self.method, base), self.settings)
+        method = make(methods.find(self.method, folders.methods), self.settings)
         data = samples(self, base)
         truth = data[0].truth(candidates)
         exact = exact_regression(data, candidates)

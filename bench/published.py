@@ -13,6 +13,11 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.files import DATA, read_text, shown
 
 
+def folder_of(name: str) -> Path:
+    """Return the folder of published results of a name in a copy of this project's repository; it may not exist."""
+    return Path(__file__).resolve().parents[1] / "results" / name
+
+
 def read_table(path: Path) -> pd.DataFrame:
     """Read a published table, every cell as text.
 

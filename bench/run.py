@@ -31,6 +31,9 @@ class Watcher(Protocol):
     def finished(self, case: Case, result: dict[str, Any]) -> None:
         """Learn that the result of a case is kept."""
 
+    def found(self) -> None:
+        """Learn that another run on the same store has finished a case in the meantime."""
+
 
 @dataclass
 class Tally:
@@ -74,7 +77,7 @@ def run(
     made = origin(_loads(suite))
     before = store.finished()
     wanted = dict(itertools.islice(zip(keys.values(), suite.cases, strict=True), shard.first - 1, None, shard.step))
-    waiting = [case for key, case in wanted.items() if key not in before or not _counts(case, *before[key], retry)]
+    waiting = [case for key, case in wanted.items() if key not in before or not counts(case, *before[key], retry)]
     tally = Tally(reused=len(wanted) - len(waiting))
     if watcher is not None:
         watcher.count(len(waiting))
@@ -115,9 +118,11 @@ class _Turns:
         if not self.leases.take(key):
             return "later"
         for found in self.store.finished(key).values():
-            if _counts(case, *found, self.retry) or self.before.get(key) != found:
+            if counts(case, *found, self.retry) or self.before.get(key) != found:
                 self.leases.give_back(key)
                 self.tally.reused += 1
+                if self.watcher is not None:
+                    self.watcher.found()
                 return "done"
         if self.watcher is not None:
             self.watcher.started(case)
@@ -140,8 +145,15 @@ def _loads(suite: Suite) -> set[str]:
     }
 
 
-def _counts(case: Case, status: str, text: str, retry: bool) -> bool:
-    """Return whether a result counts: not a failure to retry, nor a limit that has been raised since."""
+def counts(case: Case, status: str, text: str, retry: bool) -> bool:
+    """Return whether a result counts: not a failure to retry, nor a limit that has been raised since.
+
+    Args:
+        case: as it is to be run.
+        status: of the result.
+        text: the case that it is of, as JSON.
+        retry: failures do not count.
+    """
     if status not in ("timeout", "memory"):
         return not (retry and status in ("failed", "died"))
     limit = "time_limit" if status == "timeout" else "memory_limit"

@@ -62,7 +62,7 @@ def files(roots: Roots, folders: Folders) -> set[Path]:
     waiting = {_module_file(roots.module)}
     if roots.method:
         own = code_file(roots.method)
-        waiting.add(_home_of_method(roots.method) if own is None else folders.suite / own)
+        waiting.add(_home_of_method(roots.method) if own is None else folders.methods / own)
     if roots.system:
         path = folders.suite / roots.system
         waiting.add(path if path.suffix in (".py", ".toml") else _home_of_system(roots.system))

@@ -17,7 +17,7 @@ import json
 import os
 import sqlite3
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -129,6 +129,26 @@ class Store:
             cursor.executemany(
                 "INSERT INTO about VALUES (?, ?)", [(name, json.dumps(value)) for name, value in about.items()]
             )
+
+    def fill(self, keys: Iterable[str], about: Mapping[str, Any], rows: Iterable[Sequence[Any]]) -> None:
+        """Take results over as other stores have them; this one must be new.
+
+        Args:
+            keys: of the cases of the suite, in its order.
+            about: the command and what else is worth knowing.
+            rows: of `results`, with the text of the origin in place of its number.
+        """
+        with self.writing() as cursor:
+            cursor.executemany("INSERT INTO main.suite VALUES (?, ?)", enumerate(keys))
+            cursor.executemany(
+                "INSERT INTO about VALUES (?, ?)", [(name, json.dumps(value)) for name, value in about.items()]
+            )
+            for row in rows:
+                cursor.execute("INSERT OR IGNORE INTO origins (origin) VALUES (?)", (row[7],))
+                cursor.execute(
+                    "INSERT INTO results SELECT ?, ?, ?, ?, ?, ?, ?, number, ?, ? FROM origins WHERE origin = ?",
+                    (*row[:7], *row[8:], row[7]),
+                )
 
     def forget_replaced(self) -> None:
         """Remove what another source made of the planned cases, where there is a result of the planned one.

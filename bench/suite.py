@@ -50,6 +50,7 @@ import pydantic
 
 from latticebench import methods, systems
 from latticebench.bench.case import DATA, Case, Folders, Settings, code_file
+from latticebench.bench.choice import Choice
 from latticebench.bench.effort import check_cases, check_size
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.grid import Contestant, Grid
@@ -61,6 +62,7 @@ from latticebench.systems.samples import Samples
 from latticebench.systems.toml import read_toml
 
 HERE = Path(__file__).parent / "suites"
+ALL = Choice()
 
 
 Label = Annotated[str, pydantic.StringConstraints(pattern=r"\S", max_length=200)]
@@ -118,39 +120,45 @@ def file_of(name: str) -> Path:
     return HERE / f"{name}.toml"
 
 
-def load(name: str, data: Path = DATA, *, large: bool = False) -> Suite:
+def load(name: str, data: Path = DATA, *, large: bool = False, choice: Choice = ALL) -> Suite:
     """Load a suite by its name, or from a TOML file, and check every name in it.
 
     Args:
         name: of the suite, or its file.
         data: the folder of measured recordings.
         large: take it even if it asks for absurdly much, see `bench.effort`.
+        choice: which part of it.
 
     Raises:
-        InputError: the suite is unknown or unsound; the text names the file and the key.
+        InputError: the suite is unknown or unsound; the text names the file and the key. Or there is nothing in it of
+            what was chosen.
     """
     path = file_of(name)
     shown = name if name.endswith(".toml") else f"suite {name}"
     if not re.fullmatch(r"\w[\w .+=-]*", path.stem):
         raise InputError(f"{shown}: results are kept under the suite's name; begin it with a letter or a digit")
     file = _checked(_File, read_toml(path), shown)
-    folders = Folders(path.resolve().parent, data)
+    # A suite that comes with the package lies where nobody keeps methods of his own.
+    ours = not name.endswith(".toml")
+    folders = Folders(path.resolve().parent, data, Path.cwd() if ours and choice.methods else None)
     if not (file.grid or file.made or file.laboratory or file.measured):
         raise InputError(f"{shown}: no cases; write at least one [[grid]], [[made]], [[laboratory]] or [[measured]]")
+    _check_choice(choice, file, shown)
+    contestants = choice.contestants(file.methods, None if ours else folders.suite)
     cases: dict[str, Case] = {}
     blocks = (
-        _fits(file, shown, large), _trials(file, shown, folders.suite), _laboratory(file, shown),
-        _recordings(file, shown),
+        _fits(file, shown, large, choice, contestants), _trials(file, shown, folders.suite, choice),
+        _laboratory(file, shown, choice), _recordings(file, shown),
     )  # fmt: skip
     for case in itertools.chain(*blocks):
-        cases[case.identity] = case
+        # What two parts share belongs to the first.
+        if choice.takes(case):
+            cases.setdefault(case.identity, case)
         if not large:
             check_cases(len(cases), shown)
-    for label, contestant in file.methods.items():
-        try:
-            _check_method(contestant, folders.suite)
-        except InputError as error:
-            raise InputError(f"{shown}: methods.{label}: {error}") from None
+    if not cases:
+        raise InputError(f"{shown}: there is no case of this choice: {choice}")
+    _check_methods(contestants, folders.methods, shown)
     try:
         _look_up((case for case in cases.values() if isinstance(case, FitCase)), folders.suite, large)
         if not large:
@@ -159,37 +167,49 @@ def load(name: str, data: Path = DATA, *, large: bool = False) -> Suite:
                     check_size(case, getattr(case, "sites", 1), case.title)
     except InputError as error:
         raise InputError(f"{shown}: {error}") from None
-    return Suite(path.stem, file.title, cases, folders, file.methods)
+    return Suite(path.stem, file.title, cases, folders, contestants)
 
 
-def _fits(file: _File, shown: str, large: bool) -> Iterator[Case]:
-    for number, block in enumerate(file.grid, start=1):
+def _check_choice(choice: Choice, file: _File, shown: str) -> None:
+    if choice.methods and not file.grid:
+        raise InputError(f"{shown}: --methods: there are no fits in it, and so no methods to choose")
+    if choice.seeds and not (file.grid or file.made or file.laboratory):
+        raise InputError(f"{shown}: --seeds: its cases are measured recordings, which have none")
+
+
+def _fits(
+    file: _File, shown: str, large: bool, choice: Choice, contestants: Mapping[str, Contestant]
+) -> Iterator[Case]:
+    for number, content in enumerate(file.grid, start=1):
         where = f"{shown}: grid {number}"
-        grid = _checked(Grid, {**file.defaults, **block}, where)
+        block = choice.block({**file.defaults, **content}, file.methods, contestants)
+        if block is None:
+            continue
+        grid = _checked(Grid, block, where)
         if not large:
-            check_cases(grid.count(file.methods), where)
+            check_cases(grid.count(contestants), where)
         with _told(where, FitCase):
-            yield from grid.cases(file.methods, where)
+            yield from grid.cases(contestants, where)
 
 
-def _trials(file: _File, shown: str, base: Path) -> Iterator[Case]:
+def _trials(file: _File, shown: str, base: Path, choice: Choice) -> Iterator[Case]:
     if file.made:
         from latticebench.bench.trials.trial import Made, Trial
 
         for number, block in enumerate(file.made, start=1):
             where = f"{shown}: made {number}"
-            made = _checked(Made, block, where)
+            made = _checked(Made, choice.with_seeds(block), where)
             with _told(where, Trial):
                 yield from made.cases(where, base)
 
 
-def _laboratory(file: _File, shown: str) -> Iterator[Case]:
+def _laboratory(file: _File, shown: str, choice: Choice) -> Iterator[Case]:
     if file.laboratory:
         from latticebench.bench.trials.laboratory.case import Batch, Laboratory
 
         for number, block in enumerate(file.laboratory, start=1):
             where = f"{shown}: laboratory {number}"
-            batch = _checked(Batch, block, where)
+            batch = _checked(Batch, choice.with_seeds(block), where)
             with _told(where, Laboratory):
                 yield from batch.cases(where)
 
@@ -212,16 +232,20 @@ def _recordings(file: _File, shown: str) -> Iterator[Case]:
             yield one
 
 
-def _check_method(contestant: Contestant, base: Path) -> None:
-    """Make sure that a method exists, and that it has such settings where its code is of this package.
+def _check_methods(contestants: Mapping[str, Contestant], base: Path, shown: str) -> None:
+    """Make sure that methods exist, and that they have such settings where their code is of this package.
 
     A file of the user's is looked at and not imported: its code runs in the workers alone, within the limits of a case.
     """
-    path = code_file(contestant.method)
-    if path is None:
-        make(methods.find(contestant.method), contestant.settings)
-    else:
-        check_regular(base / path)
+    for label, contestant in contestants.items():
+        path = code_file(contestant.method)
+        try:
+            if path is None:
+                make(methods.find(contestant.method), contestant.settings)
+            else:
+                check_regular(base / path)
+        except InputError as error:
+            raise InputError(f"{shown}: methods.{label}: {error}") from None
 
 
 def _look_up(cases: Iterable[FitCase], base: Path, large: bool) -> None:

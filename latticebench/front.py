@@ -455,11 +455,9 @@ def results(name: str | Path) -> Mapping[str, pd.DataFrame]:
     Raises:
         InputError: there are no tables.
     """
-    from latticebench.bench.published import read_table
+    from latticebench.bench.published import folder_of, read_table
 
-    folder = Path(name)
-    if not folder.is_dir():
-        folder = Path(__file__).resolve().parents[1] / "results" / str(name)
+    folder = Path(name) if Path(name).is_dir() else folder_of(str(name))
     paths = sorted(folder.glob("*.csv"))
     if not paths:
         raise InputError(
@@ -496,24 +494,46 @@ class Run:
         return f"<p>{html.escape(repr(self))}</p>{_table(self.table())}"
 
 
-def run(suite: str | Path, *, jobs: int = 1, folder: str | Path | None = None) -> Run:
-    """Run a suite, continuing where it was stopped.
+def run(
+    suite: str | Path,
+    *,
+    only: Sequence[str] = (),
+    methods: Sequence[str | Path] = (),
+    seeds: str | Sequence[int] | None = None,
+    jobs: int = 1,
+    folder: str | Path | None = None,
+) -> Run:
+    """Run a suite or a part of it, continuing where it was stopped.
 
     Args:
         suite: a name from `latticebench list suites`, or a .toml file.
+        only: patterns such as "phi4*"; cases whose title, part, system, library, method or effect is so.
+        methods: in place of the suite's: its labels, names from `latticebench list methods`, or .py files.
+        seeds: in place of the suite's, such as "1-5" or [1, 3, 7].
         jobs: worker processes.
         folder: where results are kept; runs/SUITE if not given.
 
     Raises:
-        InputError: there is no such suite, or it is unsound.
+        InputError: there is no such suite, it is unsound, or nothing in it is what was chosen.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     found = run("tiny", only=["phi4 noise*"], methods=["stlsq"], folder=folder)
+        ...     table = found.table()
+        >>> table[["case", "status"]].to_string(index=False, header=False)
+        'phi4 noise=0.01 | lib2 | stlsq | seed 1 ok'
     """
+    from latticebench.bench.choice import chosen
     from latticebench.bench.run import run as run_suite
     from latticebench.bench.store import create
     from latticebench.bench.suite import load
 
-    loaded = load(str(suite))
+    choice = chosen(only, map(str, methods), seeds)
+    loaded = load(str(suite), choice=choice)
     place = Path(folder) if folder is not None else Path("runs") / loaded.name
-    _, tally = run_suite(loaded, create(place), jobs=jobs, about={"suite": loaded.name, "jobs": jobs})
+    about = {"suite": loaded.name, "jobs": jobs, "chosen": str(choice)}
+    _, tally = run_suite(loaded, create(place), jobs=jobs, about=about)
     return Run(place, dict(tally.statuses))
 
 

@@ -27,6 +27,7 @@ from latticebench.bench.cli import (
     inspect,
     limit,
     listing,
+    merge,
     plot,
     run,
     schema,
@@ -80,6 +81,7 @@ app.command(epilog=diagnose.EPILOG)(diagnose.diagnose)
 app.command(epilog=demo.EPILOG)(demo.demo)
 app.add_typer(data.app, name="data")
 app.command(epilog=run.EPILOG)(run.run)
+app.command(epilog=merge.EPILOG)(merge.merge)
 app.command(epilog=table.EPILOG)(table.table)
 app.command(epilog=figures.EPILOG)(figures.figures)
 app.command(epilog=compare.EPILOG)(compare.compare)

@@ -113,6 +113,25 @@ MemoryLimit = Annotated[
 Library = Annotated[str | None, typer.Option(help="A library of the system.", autocompletion=complete_libraries)]
 Terms = Annotated[str | None, typer.Option(help="Terms of your own, with ; between them.")]
 Order = Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")]
+Jobs = Annotated[int | None, typer.Option(min=1, max=1024, help="Worker processes; one per core if not given.")]
+Recordings = Annotated[Path, typer.Option(parser=place, metavar="DIR", help="The folder of measured recordings.")]
+Only = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="PATTERN",
+        help="Run only cases whose title, part, system, library, method or effect is so, such as 'phi4*'; may be given "
+        "several times.",
+    ),
+]
+Methods = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="A,B,MINE.py",
+        help="Run these methods instead of the suite's: its labels, names from `list methods`, or .py files.",
+        autocompletion=complete_methods,
+    ),
+]
+Seeds = Annotated[str | None, typer.Option(metavar="1-5", help="Run these seeds instead of the suite's; or 1,3,7.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Go on, however much time and memory it may take.")]
 JsonOut = Annotated[
     str | None,

@@ -12,60 +12,68 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from latticebench.bench.cli.options import Yes, complete_suites, place
+from latticebench.bench.cli.options import Jobs, Methods, Only, Recordings, Seeds, Yes, complete_suites, place
 from latticebench.bench.cli.table import document
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
     from latticebench.bench.case import Case
-    from latticebench.bench.store import Shard
+    from latticebench.bench.store import Shard, Store
     from latticebench.bench.suite import Suite
 
-EPILOG = "Example:  latticebench run default --jobs 2 --results runs/default"
+EPILOG = (
+    "Example:  latticebench run default --jobs 2 --results runs/default\n\n"
+    "A part of it, with a method of your own:  latticebench run paper --only 'phi4*' --methods stlsq,mine.py --dry-run"
+)
 
 
 def run(
     suite: Annotated[
         str, typer.Argument(help="A name from `list suites`, or a .toml file.", autocompletion=complete_suites)
     ],
-    jobs: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Worker processes; one per core if not given.")
-    ] = None,
+    jobs: Jobs = None,
     results: Annotated[
         Path | None, typer.Option(parser=place, metavar="DIR", help="Where results are kept; runs/SUITE if not given.")
     ] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Run cases that failed again.")] = False,
+    only: Only = None,
+    methods: Methods = None,
+    seeds: Seeds = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say how many cases it is and how long they took before; run nothing.")
+    ] = False,
     shard: Annotated[
         str | None, typer.Option(metavar="K/N", help="Run every N-th case alone, beginning with the K-th.")
     ] = None,
-    data: Annotated[Path, typer.Option(parser=place, metavar="DIR", help="The folder of measured recordings.")] = Path(
-        "data"
-    ),
+    data: Recordings = Path("data"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the tables of cases as JSON.")] = False,
     yes: Yes = False,
 ) -> None:
     """Run a suite, continuing where it was stopped, and show its results."""
-    from latticebench.bench import kinds
+    from latticebench.bench.choice import chosen
+    from latticebench.bench.progress import progress_of
     from latticebench.bench.provenance import command_line
-    from latticebench.bench.report.screen import progress_bar
     from latticebench.bench.run import run as run_suite
     from latticebench.bench.store import create
     from latticebench.bench.suite import load
 
-    loaded = load(suite, data, large=yes)
+    choice = chosen(only, methods, seeds)
+    loaded = load(suite, data, large=yes, choice=choice)
     part = shard_of(shard, len(loaded.cases))
     jobs = jobs or os.cpu_count() or 1
-    _tell_hours(suite, loaded.cases[part.first - 1 :: part.step], jobs, yes)
     folder = results if results is not None else Path("runs") / loaded.name
+    if dry_run:
+        _tell_estimate(loaded, part, jobs, folder, retry, as_json)
+        return
+    _tell_hours(suite, loaded.cases[part.first - 1 :: part.step], jobs, yes)
     store = create(folder)
-    about = {"command": command_line(), "suite": loaded.name, "jobs": jobs}
-    if loaded.contestants:
-        about["settings"] = _contestants(loaded)
+    about = {"command": command_line(), "suite": loaded.name, "jobs": jobs, "chosen": str(choice)}
+    about |= {"settings": _contestants(loaded)} if loaded.contestants else {}
     # A cluster that ends a job says so first; that is the same as Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with progress_bar(len(loaded.cases[part.first - 1 :: part.step])) as watcher:
-            found, tally = run_suite(loaded, store, jobs=jobs, retry=retry, shard=part, watcher=watcher, about=about)
+        with progress_of(len(loaded.cases[part.first - 1 :: part.step])) as watcher:
+            _, tally = run_suite(loaded, store, jobs=jobs, retry=retry, shard=part, watcher=watcher, about=about)
     except KeyboardInterrupt:
         print(
             f"stopped; {len(store.results())} results are in {folder}; the same command continues from there",
@@ -77,10 +85,52 @@ def run(
     del loaded, watcher
     if as_json:
         print(document(store, part), end="")
-        return
+    else:
+        _show(store, title, part, f"{tally.ran} run now, {tally.reused} were there; kept in {folder}")
+
+
+def _show(store: Store, title: str, part: Shard, told: str) -> None:
+    """Print the results, and what was done."""
+    from latticebench.bench import kinds
+
     kinds.show(store, title, shard=part)
-    statuses = ", ".join(f"{count} {status}" for status, count in tally.statuses.items())
-    print(f"{len(found)} cases ({statuses}); {tally.ran} run now, {tally.reused} were there; kept in {folder}")
+    statuses = store.statuses(part)
+    print(f"{sum(statuses.values())} cases ({', '.join(f'{n} {status}' for status, n in statuses.items())}); {told}")
+
+
+def _tell_estimate(suite: Suite, part: Shard, jobs: int, folder: Path, retry: bool, as_json: bool) -> None:
+    """Print what would be run, and how long it took before.
+
+    Raises:
+        InputError: JSON is asked for.
+    """
+    from latticebench.bench.effort import hours
+    from latticebench.bench.estimate import estimate
+    from latticebench.bench.progress import clock
+    from latticebench.bench.report.screen import show_rows
+
+    if as_json:
+        raise InputError("--json: a dry run has no results to print; leave one of the two out")
+    cases = suite.cases[part.first - 1 :: part.step]
+    found = estimate(suite, cases, folder, retry=retry)
+    rows = [
+        (row["method"], row["cases"], row["there"], row["known"], clock(row["seconds"]) if row["known"] else "?")
+        for row in found.methods.to_dict("records")
+    ]
+    show_rows(("method", "cases", "finished", "with a recorded time", "which is"), rows)
+    to_run = found.cases - found.there
+    print(f"{found.cases} cases, {found.there} of them finished in {folder}; {to_run} to run")
+    if found.known:
+        print(
+            f"about {clock(found.seconds(jobs))} on {jobs} worker{'s' if jobs > 1 else ''}, {found.core_hours:.2g} "
+            f"core-hours, by what {found.known} of the {to_run} took in {' and '.join(found.sources)}"
+        )
+    if found.known < to_run:
+        print(
+            f"{to_run - found.known} have not been run before: there is nothing to estimate from; by their time "
+            f"limits all {to_run} take at most {hours(cases, jobs) * to_run / found.cases:.2g} hours"
+        )
+    print("nothing was run or written")
 
 
 def _tell_hours(suite: str, cases: Sequence[Case], jobs: int, yes: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from latticebench.bench.report.mathematics import written
@@ -12,11 +12,9 @@ from latticebench.systems.errors import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress, TaskID
     from rich.text import Text as RichText
 
     from latticebench.bench.adequacy import Adequacy
-    from latticebench.bench.case import Case
     from latticebench.bench.limit import Design, Limit
     from latticebench.methods.method import Fit
 
@@ -171,38 +169,6 @@ def watching() -> Iterator[Callable[[str], None]]:
         yield lambda text: progress.update(task, description=escape(text))
 
 
-class Bar:
-    """The progress of a run: a bar with what is left, and what is running."""
-
-    def __init__(self, progress: Progress, task: TaskID, total: int) -> None:
-        """Draw on `progress`; there are `total` cases in all."""
-        self.progress, self.task, self.total = progress, task, total
-        self.running: list[str] = []
-
-    def count(self, left: int) -> None:
-        """Set how many cases are left to be run."""
-        self.progress.update(self.task, total=self.total, completed=self.total - left)
-
-    def started(self, case: Case) -> None:
-        """Show a case as running."""
-        self.running = [*(title for title in self.running if title != case.title), case.title]
-        self._name_running()
-
-    def finished(self, case: Case, result: dict[str, Any]) -> None:
-        """Count a case, and print what went wrong with it."""
-        self.running = [title for title in self.running if title != case.title]
-        # Without a terminal there is no bar; silence would look like a standstill.
-        if result["status"] not in ("ok", "skipped") or not self.progress.console.is_terminal:
-            reason = f": {result['reason']}" if result["reason"] else ""
-            line = f"{result['status']}: {case.title}{reason}"
-            self.progress.console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
-        self.progress.advance(self.task)
-        self._name_running()
-
-    def _name_running(self) -> None:
-        self.progress.update(self.task, running="   ".join(self.running[:3]))
-
-
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[], None]]:
     """Show on standard error how many of `total` pieces of work are done; calling the function counts one more."""
@@ -213,21 +179,3 @@ def progress(total: int) -> Iterator[Callable[[], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=total)
         yield lambda: bar.advance(task)
-
-
-@contextmanager
-def progress_bar(total: int) -> Iterator[Bar]:
-    """Show a run's progress on standard error while the block lasts."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TimeRemainingColumn
-    from rich.text import Text
-
-    class Running(ProgressColumn):
-        def render(self, task: Task) -> Text:
-            return Text(printable(task.fields["running"]), style="dim", overflow="ellipsis", no_wrap=True)
-
-    columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeRemainingColumn(), Running())
-    progress = Progress(*columns, console=Console(stderr=True), transient=True)
-    # Without a terminal there is no bar to be drawn, and an empty line would be left at its end.
-    with progress if progress.console.is_terminal else nullcontext():
-        yield Bar(progress, progress.add_task("cases", total=total, running=""), total)

@@ -212,6 +212,26 @@ def test_a_run_its_table_its_figures_and_its_comparison(tiny: Path) -> None:
     assert "0 losses, 0 gains, 9 the same" in succeed("compare", "tiny", "published", cwd=tiny)
 
 
+def test_a_dry_run_says_what_is_there_and_writes_nothing(tiny: Path) -> None:
+    before = sorted(tiny.rglob("*"))
+    out = succeed("run", "tiny", "--results", "tiny", "--dry-run", cwd=tiny)
+    assert "9 cases, 9 of them finished in tiny; 0 to run" in out
+    other = succeed("run", "tiny", "--results", "new", "--methods", "stlsq", "--seeds", "1-5", "--dry-run", cwd=tiny)
+    assert "15 cases, 0 of them finished in new; 15 to run" in other
+    assert "there is nothing to estimate from" in other
+    again = succeed(
+        "run", "tiny", "--results", "tiny", "--methods", "stlsq", "--seeds", "2", "--jobs", 1, "--dry-run", cwd=tiny
+    )
+    assert "by what 3 of the 3 took in tiny" in again
+    assert sorted(tiny.rglob("*")) == before
+
+
+def test_stores_are_merged_into_one_that_can_be_shown(tiny: Path) -> None:
+    assert "9 results in merged" in succeed("merge", "tiny", "--out", "merged", cwd=tiny)
+    assert succeed("table", "merged", cwd=tiny) == succeed("table", "tiny", cwd=tiny)
+    assert sorted(path.name for path in (tiny / "merged").iterdir()) == ["results.sqlite"]
+
+
 def test_comparing_names_what_got_worse_and_exits_with_1(tiny: Path) -> None:
     succeed("table", "tiny", "--out", "old", cwd=tiny)
     table = (tiny / "old" / "cases.csv").read_text()
@@ -321,6 +341,13 @@ BAD_COMMANDS = {
     "run nothing": "unknown suite",
     "run bad.toml": "unknown key 'sistem'; did you mean 'system'",
     "run tiny --results phi4.csv": "a file, not a folder",
+    "run tiny --only phi5*": "no case of this choice: only phi5*",
+    "run tiny --methods stlqs": "--methods: unknown method 'stlqs'; did you mean 'stlsq'",
+    "run tiny --methods gone.py": "gone.py: no such file",
+    "run tiny --seeds 5-1": "--seeds 5-1",
+    "run laboratory --methods stlsq": "there are no fits in it",
+    "run tiny --dry-run --json": "leave one of the two out",
+    "merge json --out new": "a store of version 2 or older",
     "run tiny --shard 0/3": "--shard 0/3: write K/N with K from 1 to N",
     "run tiny --shard 4/3": "--shard 4/3: write K/N",
     "run tiny --shard 10/12 --results new": "--shard 10/12: there is no case 10, the suite has 9",
