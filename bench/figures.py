@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,9 +28,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
+    from latticebench.bench.beside import Published
+
 FIGURES = ("coefficients", "errors", "error-against-seconds", "error-against-noise", "cost")
 # Endings of figures, and what the provenance and the program are called in such a file.
 IMAGES = {".png": ("Description", "Software"), ".svg": ("Description", "Creator"), ".pdf": ("Subject", "Creator")}
+_ENDING: ContextVar[str] = ContextVar("ending", default="")
 MARKERS = "os^Dv<>Ph*Xp"
 BOUND = "Cramer-Rao bound, all terms kept"
 # Errors of round-off size share the lowest place of an axis.
@@ -41,9 +47,15 @@ MOST_OF_A_NAME = 200
 
 
 def draw_all(
-    results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = FIGURES
+    results: Iterable[Mapping[str, Any]],
+    about: Mapping[str, Any],
+    folder: Path,
+    only: Sequence[str] = FIGURES,
+    beside: Published | None = None,
 ) -> list[Path]:
     """Draw every figure that the results allow, or those of some kinds, and return the files.
+
+    Figures of errors have what was published of the same cases, too, see `bench.beside`.
 
     Raises:
         InputError: a file cannot be written.
@@ -54,6 +66,11 @@ def draw_all(
         for name, group in panels(results).items():
             written.append(save(panel(group), folder / f"coefficients-{name}.png", about))
     table = cases(results)
+    if beside is not None:
+        names = ("part", "data", "library", "method")
+        shown = beside.cases.assign(**{name: beside.cases[name].map(label) for name in names})
+        table = replace(beside, cases=shown).joined(table)
+        about = {**about, "published": beside.about}
     if ((table["status"] == "ok") & table["e2"].notna()).any():
         drawn: dict[str, Callable[[pd.DataFrame], Figure]] = {
             "errors": errors, "error-against-seconds": error_against_seconds
@@ -352,14 +369,28 @@ def _axes(width: float, height: float) -> tuple[Figure, Axes]:
     return plt.subplots(figsize=(width, height), layout="constrained")
 
 
+@contextmanager
+def drawn_as(ending: str) -> Iterator[None]:
+    """Let `save` write figures with another ending than that of their names while the block lasts."""
+    token = _ENDING.set(ending)
+    try:
+        yield
+    finally:
+        _ENDING.reset(token)
+
+
 def save(figure: Figure, path: Path, about: Mapping[str, Any]) -> Path:
     """Write a figure with its provenance, as PNG, SVG or PDF by its ending, and close it.
+
+    Returns:
+        the file; see `drawn_as`.
 
     Raises:
         InputError: the file cannot be written, or it has another ending.
     """
     import matplotlib.pyplot as plt
 
+    path = path.with_suffix(_ENDING.get()) if _ENDING.get() else path
     if path.suffix.lower() not in IMAGES:
         raise unknown("ending", path.suffix, IMAGES, shown(path))
     key, maker = IMAGES[path.suffix.lower()]

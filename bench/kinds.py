@@ -5,6 +5,7 @@ Modules are imported when a kind is asked for: a suite of fits needs nothing of 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from latticebench.systems.errors import InputError, printable, unknown
 if TYPE_CHECKING:
     import pandas as pd
 
+    from latticebench.bench.beside import Published
     from latticebench.bench.store import Results
 
     Publisher = Callable[["Results", Mapping[str, Any], Path, Sequence[str]], list[Path]]
@@ -42,12 +44,28 @@ class Kind:
     draw: Publisher
 
 
-def _fit() -> Kind:
+def _fit(beside: Published | None = None) -> Kind:
     from latticebench.bench import figures, publish
     from latticebench.bench.report.screen import show_results
     from latticebench.bench.tables import cases
 
-    return Kind(publish.TABLES, figures.FIGURES, cases, show_results, publish.publish, figures.draw_all)
+    if beside is None:
+        return Kind(publish.TABLES, figures.FIGURES, cases, show_results, publish.publish, figures.draw_all)
+
+    def table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+        return beside.joined(cases(results))
+
+    def show(results: Iterable[Mapping[str, Any]], value: str) -> None:
+        from latticebench.bench.report.screen import show_note, show_rows
+
+        arranged = publish.matrix(table(results), value)
+        show_rows(list(arranged.columns), arranged.to_numpy().tolist())
+        show_note(f"{value}: median over seeds; {beside.mark} published: {beside.about}")
+
+    return Kind(
+        publish.TABLES, figures.FIGURES, table, show, functools.partial(publish.publish, beside=beside),
+        functools.partial(figures.draw_all, beside=beside),
+    )  # fmt: skip
 
 
 def _trial() -> Kind:
@@ -74,14 +92,16 @@ KINDS: Mapping[str, Callable[[], Kind]] = {
 
 
 def each(
-    store: Store, shard: Shard = WHOLE, *, history: bool = False
+    store: Store, shard: Shard = WHOLE, *, history: bool = False, beside: Published | None = None
 ) -> Iterator[tuple[str, Kind, Results, dict[str, Any]]]:
     """Return each kind that a store has: its name, the kind, its results, and their description.
 
     Raises:
-        InputError: the store has no results yet.
+        InputError: the store has no results yet; or none of fits, beside which published ones are to be put.
     """
     names = store.kinds()
+    if beside is not None and "fit" not in names:
+        raise InputError(f"{store.path.parent}: there are no fits in it to put beside {beside.about}")
     if not names:
         folder = store.path.parent
         raise InputError(f"{folder}: there are no results in it yet; run a suite with --results {folder}")
@@ -90,14 +110,16 @@ def each(
     for name in names:
         if name not in KINDS:
             raise InputError(f"{store.path}: it has cases of kind {name!r}, which this latticebench does not know")
-        yield name, KINDS[name](), store.results(shard, name, history=history), about
+        yield name, _fit(beside) if name == "fit" else KINDS[name](), store.results(shard, name, history=history), about
 
 
-def show(store: Store, title: str = "", value: str = "e2", shard: Shard = WHOLE) -> None:
-    """Print the results of a store, and where they come from."""
+def show(
+    store: Store, title: str = "", value: str = "e2", shard: Shard = WHOLE, beside: Published | None = None
+) -> None:
+    """Print the results of a store, and where they come from; those of fits beside published ones."""
     from latticebench.bench.report.screen import console, show_note
 
-    found = list(each(store, shard))
+    found = list(each(store, shard, beside=beside))
     if title:
         console().print(printable(title), style="bold", highlight=False, markup=False)
     with store.sound():
@@ -114,8 +136,16 @@ def rows(store: Store, shard: Shard = WHOLE) -> list[dict[str, Any]]:
     return [{str(name): value for name, value in row.items()} for frame in found for row in frame.to_dict("records")]
 
 
-def publish(store: Store, folder: Path, only: Sequence[str] | None = None) -> list[Path]:
+def publish(
+    store: Store, folder: Path, only: Sequence[str] | None = None, beside: Published | None = None
+) -> list[Path]:
     """Write the tables of a store, or those named; each kind's in a folder of its own where there are several.
+
+    Args:
+        store: the results.
+        folder: where to write.
+        only: names of tables.
+        beside: what was published of the fits.
 
     Raises:
         InputError: the store has no results yet, or a file cannot be written.
@@ -124,13 +154,19 @@ def publish(store: Store, folder: Path, only: Sequence[str] | None = None) -> li
     with store.sound():
         return [
             path
-            for name, kind, results, about in each(store)
+            for name, kind, results, about in each(store, beside=beside)
             for path in kind.publish(results, about, folder / name if several else folder, _chosen(only, kind.tables))
         ]
 
 
-def draw(store: Store, folder: Path, only: Sequence[str] | None = None) -> list[Path]:
+def draw(store: Store, folder: Path, only: Sequence[str] | None = None, beside: Published | None = None) -> list[Path]:
     """Draw the figures of a store, or those named; each kind's in a folder of its own where there are several.
+
+    Args:
+        store: the results.
+        folder: where to write.
+        only: names of figures.
+        beside: what was published of the fits.
 
     Raises:
         InputError: the store has no results yet, or a file cannot be written.
@@ -139,7 +175,7 @@ def draw(store: Store, folder: Path, only: Sequence[str] | None = None) -> list[
     with store.sound():
         return [
             path
-            for name, kind, results, about in each(store, history=True)
+            for name, kind, results, about in each(store, history=True, beside=beside)
             for path in kind.draw(results, about, folder / name if several else folder, _chosen(only, kind.figures))
         ]
 

@@ -10,21 +10,22 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.beside import Published
 from latticebench.bench.escape import csv_table, markdown
+from latticebench.bench.latex import latex
 from latticebench.bench.paired import paired
 from latticebench.bench.provenance import lines
-from latticebench.bench.tables import ABOUT, summary, tables
-from latticebench.systems.errors import printable
+from latticebench.bench.tables import ABOUT, shown_truth, summary, tables
 from latticebench.systems.files import write_text
-from latticebench.systems.terms import Term
 
 FORMATS = ("csv", "md", "tex")
 TABLES = ("cases", "coefficients", "limits", "summary", "errors", "paired")
+# Of these, those that have what was published beside a run.
+JOINED = ("cases", "summary", "errors", "paired")
 # A longer table is for programs.
 MOST_READ = 1000
-NUMBER = re.compile(r"(-?)(\d+)(?:\.(\d+))?(?:e([+-]\d+))?")
-# What a LaTeX table needs; without T1 a vertical bar is printed as a dash.
-NEEDS = r"needs \usepackage{booktabs,siunitx} \usepackage[T1]{fontenc}"
+# The number that a cell of `matrix` begins with.
+LEADING = re.compile(r"(inf|\d+(?:\.\d+)?(?:e[+-]\d+)?)(?: |$)")
 
 
 def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
@@ -76,18 +77,42 @@ def format_number(value: Any) -> str:
     return f"{value:.2g}" if 1e-3 <= abs(value) < 1e4 or value == 0 else f"{value:.1e}"
 
 
+def best(wide: pd.DataFrame) -> pd.DataFrame:
+    """Return which cells of a matrix of errors are the least of their row.
+
+    Methods that are shown the truth do not count.
+    """
+    others = [*ABOUT, "bound", *(name for name in wide.columns if shown_truth(str(name)))]
+    found = pd.DataFrame(False, index=wide.index, columns=wide.columns)
+    for row, cells in wide.drop(columns=others, errors="ignore").iterrows():
+        values = {name: float(number[1]) for name, cell in cells.items() if (number := LEADING.match(cell))}
+        least = min(values.values(), default=np.inf)
+        if np.isfinite(least) and len(values) > 1:
+            found.loc[row, [name for name, value in values.items() if value == least]] = True
+    return found
+
+
 def publish(
-    results: Iterable[Mapping[str, Any]], about: Mapping[str, Any], folder: Path, only: Sequence[str] = TABLES
+    results: Iterable[Mapping[str, Any]],
+    about: Mapping[str, Any],
+    folder: Path,
+    only: Sequence[str] = TABLES,
+    beside: Published | None = None,
 ) -> list[Path]:
     """Write the tables, each as CSV, Markdown and LaTeX with its provenance.
 
-    A table without rows is left out; one of more than MOST_READ rows is for programs, and written as CSV alone.
+    A table without rows is left out; one of more than MOST_READ rows is for programs, and written as CSV alone. What
+    was published is put beside the results of the same cases, see `bench.beside`.
 
     Raises:
         InputError: a file cannot be written.
     """
     made = tables(results)
     every = made["cases"]
+    told = dict.fromkeys(TABLES, about)
+    if beside is not None:
+        every = made["cases"] = beside.joined(every)
+        told |= {name: {**about, "published": beside.about} for name in JOINED}
     made |= {"summary": summary(every), "errors": matrix(every), "paired": paired(every)}
     written = []
     for name in only:
@@ -96,18 +121,19 @@ def publish(
             if frame.empty:
                 continue
             path = folder / f"{name}.{form}"
-            write_text(path, render(frame, about, form))
+            write_text(path, render(frame, told[name], form, name))
             written.append(path)
     return written
 
 
-def render(frame: pd.DataFrame, about: Mapping[str, Any], form: str) -> str:
+def render(frame: pd.DataFrame, about: Mapping[str, Any], form: str, name: str = "") -> str:
     """Return a table as text with its provenance.
 
     Args:
         frame: the table; a column `term` holds terms of the term language.
         about: the provenance, see `bench.provenance`.
         form: `csv` with all digits, `md` or `tex` with two digits.
+        name: of the table, one of TABLES.
     """
     head = lines(about)
     if form == "csv":
@@ -115,8 +141,7 @@ def render(frame: pd.DataFrame, about: Mapping[str, Any], form: str) -> str:
     shown = readable(_without_empty(frame.drop(columns=[name for name in ("identity", "settings") if name in frame])))
     if form == "md":
         return markdown_table(shown) + "\n\n" + "".join(f"{line}\n" for line in markdown_list(head))
-    shown.columns = pd.Index([printable(str(name)) for name in shown.columns])
-    return "".join(f"% {line}\n" for line in (NEEDS, *head)) + _latex(shown.map(lambda value: printable(str(value))))
+    return latex(shown, about, name, best(shown) if name == "errors" else None)
 
 
 def readable(frame: pd.DataFrame) -> pd.DataFrame:
@@ -147,37 +172,3 @@ def markdown_table(frame: pd.DataFrame) -> str:
 def markdown_list(texts: Iterable[str]) -> list[str]:
     """Return texts as the lines of a Markdown list."""
     return [f"- {markdown(text)}" for text in texts]
-
-
-def _latex(texts: pd.DataFrame) -> str:
-    """Write a table of texts with the rules of booktabs; a column with numbers in it is one of siunitx."""
-    style = texts.style.hide(axis="index").format_index(escape="latex", axis=1)
-    columns = []
-    for name in texts.columns:
-        numbers = [found for text in texts[name] if (found := NUMBER.fullmatch(text))]
-        columns.append(_number_column(numbers) if numbers else "l")
-        if name == "term":
-            style.format(lambda text: f"${Term(str(text)).latex}$", subset=[name])
-        else:
-            style.format(_number_cell if numbers else None, escape="latex", subset=[name])
-    return str(style.to_latex(hrules=True, siunitx=True, column_format="".join(columns)))
-
-
-def _number_column(numbers: Sequence[re.Match[str]]) -> str:
-    """Return the column of siunitx that is wide enough for each of the numbers."""
-    sign = "-" if any(one[1] for one in numbers) else ""
-    whole = max(len(one[2]) for one in numbers)
-    decimals = max(len(one[3] or "") for one in numbers)
-    exponents = [int(one[4]) for one in numbers if one[4]]
-    form = f"{sign}{whole}" + (f".{decimals}" if decimals else "")
-    if exponents:
-        form += f"e{'-' if min(exponents) < 0 else ''}{max(len(str(abs(one))) for one in exponents)}"
-    return f"S[table-format={form}]"
-
-
-def _number_cell(value: object) -> str:
-    """Write a number as siunitx reads it; braces keep other texts from being read as one."""
-    text = str(value)
-    if found := NUMBER.fullmatch(text):
-        return text[: found.start(4) - 1] + f"e{int(found[4])}" if found[4] else text
-    return f"{{{text}}}" if text else ""

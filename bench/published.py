@@ -18,6 +18,16 @@ def folder_of(name: str) -> Path:
     return Path(__file__).resolve().parents[1] / "results" / name
 
 
+def read_head(path: Path) -> dict[str, str]:
+    """Return the provenance in the head of a published table, by name; empty where there is none.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    head = itertools.takewhile(lambda line: line.startswith("# "), read_text(path, DATA).splitlines())
+    return {name: value for line in head for name, _, value in [line[2:].partition(": ")]}
+
+
 def read_table(path: Path) -> pd.DataFrame:
     """Read a published table, every cell as text.
 

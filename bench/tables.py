@@ -96,7 +96,7 @@ def _head(case: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def named(case: Mapping[str, Any]) -> str:
     """Return what a case's method is called in tables and figures: its label, marked where it is shown the truth."""
-    return f"{case['label']}{SHOWN if _takes_truth(case['method']) else ''}"
+    return f"{case['label']}{SHOWN if takes_truth(case['method']) else ''}"
 
 
 def shown_truth(name: str) -> bool:
@@ -105,7 +105,7 @@ def shown_truth(name: str) -> bool:
 
 
 @functools.cache
-def _takes_truth(method: str) -> bool:
+def takes_truth(method: str) -> bool:
     """Return whether a method of this package is shown the truth; code of a user's is not run to draw a table."""
     kind = methods.registered().get(method)
     return kind is not None and kind().abilities.truth

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.options import place
+from latticebench.bench.cli.options import Beside, place
 from latticebench.systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
+    from latticebench.bench.beside import Published
     from latticebench.bench.store import Store
 
 # Endings of files with which no folder is meant.
@@ -25,40 +26,46 @@ def figures(
     out: Annotated[
         Path | None,
         typer.Option(
-            parser=place, metavar="DIR", help="Where to write them; DIR/figures if not given. One figure: a .png."
+            parser=place,
+            metavar="DIR",
+            help="Where to write them; DIR/figures if not given. One figure: a .png, .svg or .pdf.",
         ),
     ] = None,
     only: Annotated[
         list[str] | None, typer.Option(help="Draw this kind of figure alone; may be given several times.")
     ] = None,
+    beside: Beside = None,
 ) -> None:
     """Draw the results of a run: coefficients by iteration, errors by time and noise, effects by what was named."""
     from latticebench.bench import kinds
+    from latticebench.bench.beside import read_published
     from latticebench.bench.store import open_store
 
     kinds.check_figures(only)
     store = open_store(folder)
+    published = None if beside is None else read_published(beside)
     if out is not None and out.suffix.lower() in ENDINGS:
-        _draw_one(store, out, only)
+        _draw_one(store, out, only, published)
         return
-    for path in kinds.draw(store, folder / "figures" if out is None else out, only):
+    for path in kinds.draw(store, folder / "figures" if out is None else out, only, published):
         print(path)
 
 
-def _draw_one(store: Store, out: Path, only: list[str] | None) -> None:
+def _draw_one(store: Store, out: Path, only: list[str] | None, beside: Published | None) -> None:
     """Draw a single figure into a file.
 
     Raises:
-        InputError: it is to be something else than a PNG, or there are several figures, or none.
+        InputError: its ending is that of no figure, or there are several figures, or none.
     """
     from latticebench.bench import kinds
+    from latticebench.bench.figures import IMAGES, drawn_as
     from latticebench.systems.files import check_outputs, shown, whole
 
-    if out.suffix.lower() != ".png":
-        raise unknown("ending", out.suffix, [".png"], f"--out {shown(out)}")
+    if out.suffix.lower() not in IMAGES:
+        raise unknown("ending", out.suffix, IMAGES, f"--out {shown(out)}")
     check_outputs({"--out": out})
-    with tempfile.TemporaryDirectory() as drawn:
-        found = kinds.draw(store, Path(drawn), only)
+    with tempfile.TemporaryDirectory() as drawn, drawn_as(out.suffix.lower()):
+        found = kinds.draw(store, Path(drawn), only, beside)
         if len(found) != 1:
             raise InputError(
                 f"--out {shown(out)}: there are {len(found)} figures; choose one with --only, or give a folder"

@@ -113,6 +113,13 @@ MemoryLimit = Annotated[
 Library = Annotated[str | None, typer.Option(help="A library of the system.", autocompletion=complete_libraries)]
 Terms = Annotated[str | None, typer.Option(help="Terms of your own, with ; between them.")]
 Order = Annotated[int | None, typer.Option(min=1, max=2, help="Order of the time derivative.")]
+Beside = Annotated[
+    Path | None,
+    typer.Option(
+        "--with", metavar="DIR", parser=place,
+        help="Put these results beside the run's, of the same cases: published tables, or another store.",
+    ),
+]  # fmt: skip
 Jobs = Annotated[int | None, typer.Option(min=1, max=1024, help="Worker processes; one per core if not given.")]
 Recordings = Annotated[Path, typer.Option(parser=place, metavar="DIR", help="The folder of measured recordings.")]
 Only = Annotated[

@@ -8,14 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.options import place
-from latticebench.systems.errors import unknown
+from latticebench.bench.cli.options import Beside, place
+from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
     from latticebench.bench.store import Shard, Store
 
-EPILOG = "Example:  latticebench table runs/default --out results/default"
+EPILOG = (
+    "Example:  latticebench table runs/default --out results/default\n\n"
+    "Beside what was published:  latticebench table runs/mine --with results/paper --out published"
+)
 
 
 def table(
@@ -28,10 +31,12 @@ def table(
     only: Annotated[
         list[str] | None, typer.Option(help="Publish this table alone; may be given several times.")
     ] = None,
+    beside: Beside = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the tables of cases as JSON.")] = False,
 ) -> None:
     """Show the results of a run as a table, and publish them."""
     from latticebench.bench import kinds
+    from latticebench.bench.beside import read_published
     from latticebench.bench.store import open_store
     from latticebench.bench.tables import SCORES
 
@@ -39,12 +44,15 @@ def table(
         raise unknown("score", value, SCORES, "--value")
     kinds.check_tables(only)
     store = open_store(folder)
+    published = None if beside is None else read_published(beside)
     if as_json:
+        if published is not None:
+            raise InputError("--json: it has the run alone; leave --with out, or take the CSV files of --out")
         print(document(store), end="")
     else:
-        kinds.show(store, value=value)
+        kinds.show(store, value=value, beside=published)
     if out is not None:
-        for path in kinds.publish(store, out, only):
+        for path in kinds.publish(store, out, only, published):
             print(shown(path), file=sys.stderr if as_json else sys.stdout)
 
 
