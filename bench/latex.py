@@ -50,6 +50,8 @@ CAPTIONS = {
     "cases": "Scores of each case.", "coefficients": "Coefficients of each fit and their truth.",
     "limits": "The smallest standard error that an unbiased method can have.",
     "summary": "Scores of each method, medians over the seeds.",
+    "against": "Cases won, lost and tied by E2; median ratio of E2 with its 95 % interval by a bootstrap over the "
+    "cases; p of the signed-rank test after Holm's correction.",
     "paired": "Which of two methods has the smaller E2: signed-rank test over cases and seeds, p after Holm's "
     "correction.",
 }  # fmt: skip

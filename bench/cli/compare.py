@@ -1,24 +1,61 @@
-"""`latticebench compare`: judge one run by another."""
+"""`latticebench compare`: judge one run by another, or methods by one of them."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from latticebench.systems.errors import printable
+from latticebench.bench.cli.options import Beside, place
+from latticebench.systems.errors import InputError, printable, unknown
 
-EPILOG = "Example:  latticebench compare results/default runs/default"
+if TYPE_CHECKING:
+    from latticebench.bench.against import Contest
+
+EPILOG = (
+    "Example:  latticebench compare results/default runs/default\n\n"
+    "Methods:  latticebench compare runs/mine --with results/paper --against stlsq --out ranks.pdf"
+)
+TABLES = (".csv", ".md", ".tex")
 
 
 def compare(
     old: Annotated[Path, typer.Argument(help="A store, a folder of published tables, or one table.")],
-    new: Annotated[Path, typer.Argument(help="The same, to be judged.")],
+    new: Annotated[Path | None, typer.Argument(help="The same, to be judged; none with --against.")] = None,
     factor: Annotated[float, typer.Option(min=1.0, help="An error that grew beyond this factor is a loss.")] = 2.0,
+    reference: Annotated[
+        str | None, typer.Option("--against", metavar="METHOD", help="Compare the methods of one run with this one.")
+    ] = None,
+    beside: Beside = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            parser=place, metavar="FILE",
+            help="With --against: mean ranks as .png, .svg or .pdf, or wins and losses as .csv, .md or .tex.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
-) -> None:
-    """Compare two runs case by case, and each method by a paired test; exit code 1 when any case is a loss."""
+) -> None:  # fmt: skip
+    """Compare two runs case by case, and each method by a paired test; exit code 1 when any case is a loss.
+
+    With --against, compare the methods of one run with one of them.
+    """
+    if reference is not None:
+        if new is not None:
+            raise InputError(f"--against: give one run, and others of the same cases with --with {new}")
+        if as_json:
+            raise InputError("--json: it is for two runs; of --against write a table for programs with --out FILE.csv")
+        _compare_methods(old, reference, beside, out)
+        return
+    if new is None:
+        raise InputError(f"compare {old} with what? Give a second run, or a method of this one with --against METHOD")
+    if beside is not None or out is not None:
+        raise InputError("--with and --out go with --against METHOD; two runs are compared without them")
+    _compare_runs(old, new, factor, as_json)
+
+
+def _compare_runs(old: Path, new: Path, factor: float, as_json: bool) -> None:
     from latticebench.bench.compare import compare as compare_runs
     from latticebench.bench.compare import read_run
 
@@ -43,3 +80,63 @@ def compare(
         print(f"{counts} (within a factor of {factor:g})")
     if len(found.worse):
         raise typer.Exit(1)
+
+
+def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path | None) -> None:
+    """Print and write how methods do against one of them.
+
+    Raises:
+        InputError: there is no such method, or nothing that could be written to such a file.
+    """
+    from latticebench.bench.against import against
+    from latticebench.bench.beside import read_published
+    from latticebench.bench.figures import IMAGES
+    from latticebench.bench.provenance import command_line, commit
+    from latticebench.bench.tables import read_cases
+
+    if out is not None and out.suffix.lower() not in (*IMAGES, *TABLES):
+        raise unknown("ending", out.suffix, (*IMAGES, *TABLES), f"--out {out}")
+    table = read_cases(run)
+    about = {"command": command_line(), "commit": commit()}
+    if beside is not None:
+        published = read_published(beside)
+        table = published.joined(table)
+        about["published"] = published.about
+    found = against(table, reference)
+    _show(found)
+    if out is not None:
+        _write(found, out, about)
+        print(out)
+
+
+def _show(found: Contest) -> None:
+    from latticebench.bench.publish import readable
+    from latticebench.bench.report.screen import show_note, show_rows
+
+    shown = readable(found.methods)
+    show_rows(list(shown.columns), shown.to_numpy().tolist())
+    show_note("per case: E2 smaller, larger, not told apart; ratio of E2, median over the cases with its 95 % interval")
+    if found.ranks is None:
+        show_note("no mean ranks: they need three methods and two cases that all of them have")
+        return
+    ranks = found.ranks
+    show_rows(["method", "mean rank"], [[name, f"{rank:.2f}"] for name, rank in ranks.mean.items()])
+    left_out = f"; left out, with too few of them: {', '.join(ranks.left_out)}" if ranks.left_out else ""
+    show_note(
+        f"mean rank of E2 over {ranks.cases} cases, p = {ranks.p:.2g} (Friedman); those that differ by less than "
+        f"{ranks.distance:.2f} are not told apart (Nemenyi){left_out}"
+    )
+
+
+def _write(found: Contest, out: Path, about: dict[str, Any]) -> None:
+    from latticebench.bench.figures import IMAGES, save
+    from latticebench.bench.publish import render
+    from latticebench.bench.ranking import draw_ranks
+    from latticebench.systems.files import write_text
+
+    if out.suffix.lower() in IMAGES:
+        if found.ranks is None:
+            raise InputError(f"--out {out}: there are no mean ranks to draw; they need three methods and two cases")
+        save(draw_ranks(found.ranks), out, about)
+    else:
+        write_text(out, render(found.methods, about, out.suffix.lower()[1:], "against"))

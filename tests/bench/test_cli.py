@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
@@ -232,6 +233,32 @@ def test_stores_are_merged_into_one_that_can_be_shown(tiny: Path) -> None:
     assert sorted(path.name for path in (tiny / "merged").iterdir()) == ["results.sqlite"]
 
 
+def test_a_method_in_one_file_stands_beside_the_paper_after_three_commands(tmp_path: Path) -> None:
+    root = Path(__file__).parents[2]
+    shutil.copy(root / "docs" / "data" / "ridge.py", tmp_path / "mine.py")
+    paper = root / "results" / "paper"
+    only = ["--only", "1[abc]", "--only", "2a, noise"]
+    succeed("run", "paper", "--methods", "mine.py", *only, "--results", "mine", "--jobs", 1, cwd=tmp_path)
+    shown = succeed("table", "mine", "--with", paper, "--out", "published", cwd=tmp_path)
+    assert "stlsq*" in shown
+    assert "* published: results/paper, commit b9656e544ace" in shown
+    table = (tmp_path / "published" / "errors.tex").read_text()
+    assert all(f"\n{part} & " in table for part in ("1a", "1b", "1c", "2a, noise"))
+    assert "& {mine} & {pinn*} &" in table
+    succeed("figures", "mine", "--with", paper, "--only", "errors", "--out", "errors.pdf", cwd=tmp_path)
+    assert (tmp_path / "errors.pdf").read_bytes().startswith(b"%PDF")
+    told = succeed("compare", "mine", "--with", paper, "--against", "stlsq", "--out", "ranks.svg", cwd=tmp_path)
+    assert "not told apart" in told
+    assert "mean rank of E2 over 4 cases" in told
+    assert (tmp_path / "ranks.svg").read_text().startswith("<?xml")
+    succeed("compare", "mine", "--with", paper, "--against", "mine", "--out", "against.csv", cwd=tmp_path)
+    assert "published: results/paper" in (tmp_path / "against.csv").read_text()
+    bad = latticebench("figures", "mine", "--only", "errors", "--out", "errors.gif", cwd=tmp_path)
+    assert (bad.returncode, "unknown ending '.gif'" in bad.stderr) == (2, True)
+    lone = latticebench("table", "mine", "--with", root / "results" / "limits", cwd=tmp_path)
+    assert (lone.returncode, "it has none of these cases" in lone.stderr) == (2, True)
+
+
 def test_comparing_names_what_got_worse_and_exits_with_1(tiny: Path) -> None:
     succeed("table", "tiny", "--out", "old", cwd=tiny)
     table = (tiny / "old" / "cases.csv").read_text()
@@ -358,6 +385,11 @@ BAD_COMMANDS = {
     "table .": "not a store",
     "figures .": "not a store",
     "compare phi4.csv phi4.csv": "column 'identity' is missing",
+    "compare json": "compare json with what?",
+    "compare json json --against a": "give one run",
+    "compare phi4.csv --against a --json": "--out FILE.csv",
+    "compare phi4.csv phi4.csv --out x.pdf": "go with --against",
+    "compare phi4.csv --against a --out x.bmp": "unknown ending '.bmp'",
     "limit --system phi4": "--library",
     "limit --terms u[n] --order 2": "--system",
     "limit --system phi4 --library lib2 --noise 0": "must be a number above 0",
