@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from latticebench.bench.provenance import describe
-from latticebench.bench.published import read_head
+from latticebench.bench.published import folder_of, read_head
 from latticebench.bench.store import is_store, open_store
 from latticebench.bench.tables import ABOUT, SHOWN, read_cases, takes_truth
 from latticebench.systems.errors import InputError
@@ -66,9 +66,14 @@ class Published:
 def read_published(folder: Path) -> Published:
     """Read what was published, or the store of another run.
 
+    Args:
+        folder: a folder or a table; or the name of one in `results` of a copy of this project's repository.
+
     Raises:
         InputError: there is no table of cases.
     """
+    if not os.path.exists(folder) and folder_of(str(folder)).is_dir():
+        folder = folder_of(str(folder))
     cases = read_cases(folder)
     if is_store(folder):
         store = open_store(folder)

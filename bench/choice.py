@@ -59,7 +59,7 @@ class Choice:
         """
         if not self.methods:
             return dict(own)
-        registered = methods.registered()
+        registered, brought = methods.registered(), methods.brought()
         found: dict[str, Contestant] = {}
         for name in self.methods:
             if name in own:
@@ -69,10 +69,10 @@ class Choice:
                 label = wanted or Path(path).stem
                 taken = label in {*own, *found, *registered}
                 found[name if taken else label] = Contestant(method=_from(base, path) + (wanted and f":{wanted}"))
-            elif name in registered:
+            elif name in registered or name in brought:
                 found[name] = Contestant(method=name)
             else:
-                error = unknown("method", name, {*own, *registered}, "--methods")
+                error = unknown("method", name, {*own, *registered, *brought}, "--methods")
                 raise InputError(f"{error} (or the path of a .py file)")
         return found
 

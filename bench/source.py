@@ -21,6 +21,7 @@ from pathlib import Path
 
 from latticebench import methods, systems
 from latticebench.bench.case import Case, Folders, Roots, code_file
+from latticebench.systems import packages
 from latticebench.systems.errors import unknown
 
 PACKAGE = "latticebench"
@@ -62,10 +63,10 @@ def files(roots: Roots, folders: Folders) -> set[Path]:
     waiting = {_module_file(roots.module)}
     if roots.method:
         own = code_file(roots.method)
-        waiting.add(_home_of_method(roots.method) if own is None else folders.methods / own)
+        waiting |= _home_of_method(roots.method) if own is None else {folders.methods / own}
     if roots.system:
         path = folders.suite / roots.system
-        waiting.add(path if path.suffix in (".py", ".toml") else _home_of_system(roots.system))
+        waiting |= {path} if path.suffix in (".py", ".toml") else _home_of_system(roots.system)
     if roots.recording and os.path.isfile(folders.data / roots.recording):
         waiting.add(folders.data / roots.recording)
     found: set[Path] = set()
@@ -77,13 +78,20 @@ def files(roots: Roots, folders: Folders) -> set[Path]:
     return found
 
 
-@functools.cache
-def _home_of_method(name: str) -> Path:
-    return Path(inspect.getfile(methods.find(name)))
+def _home_of_method(name: str) -> set[Path]:
+    """Return the module that defines a method; of one that another package brings, all modules of that package."""
+    others = methods.brought()
+    return packages.sources(others[name]) if name in others else {Path(inspect.getfile(methods.find(name)))}
+
+
+def _home_of_system(name: str) -> set[Path]:
+    """Return the same of a system."""
+    others = systems.brought()
+    return packages.sources(others[name]) if name in others else {_own_home(name)}
 
 
 @functools.cache
-def _home_of_system(name: str) -> Path:
+def _own_home(name: str) -> Path:
     """Return the module that defines a system of this package."""
     for info in pkgutil.iter_modules(systems.__path__):
         module = importlib.import_module(f"{PACKAGE}.systems.{info.name}")

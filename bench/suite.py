@@ -235,11 +235,14 @@ def _recordings(file: _File, shown: str) -> Iterator[Case]:
 def _check_methods(contestants: Mapping[str, Contestant], base: Path, shown: str) -> None:
     """Make sure that methods exist, and that they have such settings where their code is of this package.
 
-    A file of the user's is looked at and not imported: its code runs in the workers alone, within the limits of a case.
+    A file of the user's is looked at and not imported: its code runs in the workers alone, within the limits of a case,
+    and so does that of other packages.
     """
     for label, contestant in contestants.items():
         path = code_file(contestant.method)
         try:
+            if contestant.method in methods.brought():
+                continue
             if path is None:
                 make(methods.find(contestant.method), contestant.settings)
             else:
@@ -264,9 +267,10 @@ def _look_up(cases: Iterable[FitCase], base: Path, large: bool) -> None:
         path = code_file(case.system)
         if path is not None:
             check_regular(base / path)
+        apart = path is not None or case.system in systems.brought()
         if not large:
-            check_size(case, case.sites or (systems.find(case.system, base).sites if path is None else 1), case.data)
-        if path is not None:
+            check_size(case, case.sites or (1 if apart else systems.find(case.system, base).sites), case.data)
+        if apart:
             continue
         system, candidates = case.resolve(base)
         system.with_parameters(case.parameters)

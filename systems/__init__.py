@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 from latticebench.systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
     from latticebench.systems.lattice import System
 
 
@@ -26,16 +28,26 @@ def names() -> list[str]:
     )
 
 
+def brought() -> dict[str, EntryPoint]:
+    """Return the systems that other packages bring, by name; none of them is imported, and none hides one of ours."""
+    from latticebench.systems import packages
+
+    own = names()
+    return {name: entry for name, entry in packages.brought(packages.SYSTEMS).items() if name not in own}
+
+
 def find(name: str, base: Path | None = None) -> System:
     """Return a system by its name, or load it from a user's `.py` or `.toml` file.
 
     Args:
-        name: a name from `names()`, or the path of a file.
+        name: a name from `names()` or `brought()`, or the path of a file.
         base: the folder that a relative path starts from; the working directory if None.
 
     Raises:
-        InputError: there is no such system or file, or the file does not hold a valid system.
+        InputError: there is no such system or file, or the file or the package does not hold a valid system.
     """
+    from latticebench.systems import packages
+    from latticebench.systems.lattice import System
     from latticebench.systems.user_files import load_system
 
     if name.endswith((".py", ".toml")):
@@ -44,5 +56,11 @@ def find(name: str, base: Path | None = None) -> System:
         system = getattr(importlib.import_module(f"{__name__}.{info.name}"), "SYSTEM", None)
         if system is not None and system.name == name:
             return system  # type: ignore[no-any-return]
-    error = unknown("system", name, names())
+    others = brought()
+    if name in others:
+        found = packages.load(others[name])
+        if not isinstance(found, System):
+            raise InputError(f"{packages.package(others[name])}: {others[name].value} must be a System")
+        return found
+    error = unknown("system", name, [*names(), *others])
     raise InputError(f"{error} (or the path of a .py or .toml file)")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 import typer
 
 from latticebench.bench.cli.options import suite_files
+from latticebench.systems.errors import InputError
 
 Kind = Literal["systems", "libraries", "methods", "suites", "effects"]
 
@@ -37,9 +39,13 @@ def list_(
 def _system_rows() -> list[dict[str, Any]]:
     from latticebench import systems
 
-    rows = []
-    for name in systems.names():
-        system = systems.find(name)
+    rows: list[dict[str, Any]] = []
+    for name in [*systems.names(), *systems.brought()]:
+        try:
+            system = systems.find(name)
+        except InputError as error:
+            rows.append({**dict.fromkeys(rows[0], ""), "name": name, "source": str(error)})
+            continue
         rows.append(
             {
                 "name": name, "equation": f"u{chr(39) * system.order} = {system.equation}",
@@ -62,9 +68,21 @@ def _library_rows() -> list[dict[str, Any]]:
             "terms": list(library.texts),
             "source": library.source,
         }
-        for name in systems.names()
+        for name in [*systems.names(), *_sound_systems()]
         for library in systems.find(name).libraries
     ]
+
+
+def _sound_systems() -> list[str]:
+    """Return the names of systems that other packages bring and that can be imported."""
+    from latticebench import systems
+
+    found = []
+    for name in systems.brought():
+        with suppress(InputError):
+            systems.find(name)
+            found.append(name)
+    return found
 
 
 def _method_rows() -> list[dict[str, Any]]:
@@ -72,7 +90,12 @@ def _method_rows() -> list[dict[str, Any]]:
     from latticebench.methods.method import settings
 
     rows = []
-    for name, kind in methods.registered().items():
+    for name in [*methods.registered(), *methods.brought()]:
+        try:
+            kind = methods.find(name)
+        except InputError as error:
+            rows.append({"name": name, "what it is": str(error), "settings": {}})
+            continue
         # JSON has lists alone.
         values = {key: list(value) if isinstance(value, tuple) else value for key, value in settings(kind).items()}
         about = (kind.__doc__ or "").strip().splitlines()[0]

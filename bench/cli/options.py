@@ -16,14 +16,14 @@ def complete_systems(incomplete: str) -> list[str]:
     """Return the systems whose names begin with `incomplete`."""
     from latticebench import systems
 
-    return [name for name in systems.names() if name.startswith(incomplete)]
+    return [name for name in [*systems.names(), *systems.brought()] if name.startswith(incomplete)]
 
 
 def complete_methods(incomplete: str) -> list[str]:
     """Return the methods whose names begin with `incomplete`."""
     from latticebench import methods
 
-    return [name for name in methods.registered() if name.startswith(incomplete)]
+    return [name for name in [*methods.registered(), *methods.brought()] if name.startswith(incomplete)]
 
 
 def complete_suites(incomplete: str) -> list[str]:
@@ -117,7 +117,7 @@ Beside = Annotated[
     Path | None,
     typer.Option(
         "--with", metavar="DIR", parser=place,
-        help="Put these results beside the run's, of the same cases: published tables, or another store.",
+        help="Put these results of the same cases beside the run's: published tables, such as paper, or a store.",
     ),
 ]  # fmt: skip
 Jobs = Annotated[int | None, typer.Option(min=1, max=1024, help="Worker processes; one per core if not given.")]

@@ -167,7 +167,7 @@ def shard_of(text: str | None, cases: int) -> Shard:
 
 
 def _contestants(suite: Suite) -> dict[str, str]:
-    """Return what each label of a suite stands for, with all its settings; of a user's file, with those given."""
+    """Return what each label of a suite stands for, with all its settings; of others' code, with those given."""
     from latticebench import methods
     from latticebench.bench.case import code_file
     from latticebench.methods.method import make, settings
@@ -175,7 +175,7 @@ def _contestants(suite: Suite) -> dict[str, str]:
     written = {}
     for label, one in suite.contestants.items():
         values: dict[str, Any] = dict(one.settings)
-        if code_file(one.method) is None:
+        if code_file(one.method) is None and one.method not in methods.brought():
             kind = methods.find(one.method)
             chosen = make(kind, one.settings)
             values = {name: getattr(chosen, name) for name in settings(kind)}
