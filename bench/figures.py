@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from latticebench.bench.colours import SERIES, series
+from latticebench.bench.colours import FAINT, SERIES, series
 from latticebench.bench.escape import label
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.provenance import lines
@@ -169,31 +169,43 @@ def _with_error(name: str, result: Mapping[str, Any]) -> str:
 
 
 def errors(table: pd.DataFrame) -> Figure:
-    """Draw the median E2 by system and method: one row per data and library, one mark per method."""
+    """Draw the median E2 by system and method: one row per data and library, one mark per method.
+
+    The marks of a row lie a little above each other, since methods of equal errors would hide one another.
+    """
     short = summary(table)
     short = short[short["e2"].notna()]
     rows = list(dict.fromkeys(zip(short["data"], short["library"], strict=True)))
     methods = list(dict.fromkeys(short["method"]))
-    figure, axes = _axes(7.5, 1.2 + 0.28 * len(rows))
+    figure, axes = _axes(7.5, 1.2 + max(0.28, 0.04 * len(methods)) * len(rows))
     for k, method in enumerate(methods):
         chosen = short[short["method"] == method]
-        places = [rows.index(pair) for pair in zip(chosen["data"], chosen["library"], strict=True)]
+        beside = 0.7 * ((k + 0.5) / len(methods) - 0.5)
+        places = [rows.index(pair) + beside for pair in zip(chosen["data"], chosen["library"], strict=True)]
         axes.plot(
             _bounded(chosen["e2"]),
             places,
             MARKERS[k % len(MARKERS)],
             color=series(k),
             label=method,
-            ms=6,
-            alpha=0.85,
+            ms=4.5,
         )
+    for place in range(1, len(rows)):
+        axes.axhline(place - 0.5, color=FAINT, lw=0.6, zorder=0)
     axes.set_xscale("log")
     axes.set_yticks(range(len(rows)), [f"{data}   {library}" for data, library in rows], fontsize=8)
-    axes.invert_yaxis()
-    axes.grid(axis="both", alpha=0.25)
-    axes.set_xlabel(f"relative error of the coefficients, E2 (median over seeds; below {LOWEST:.0e}: round-off)")
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.grid(axis="x", alpha=0.25)
+    told = f"relative error of the coefficients, E2 (median over seeds; below {LOWEST:.0e}: round-off)"
+    axes.set_xlabel(f"{told}{_published(table)}")
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
     return figure
+
+
+def _published(table: pd.DataFrame) -> str:
+    """Return what the asterisk of published methods means; empty where there is none, see `bench.beside`."""
+    commits = [one for one in table["published"].unique() if one] if "published" in table else []
+    return f"\n* published, commit {', '.join(commits)}" if commits else ""
 
 
 def error_against_seconds(table: pd.DataFrame) -> Figure:
@@ -209,7 +221,7 @@ def error_against_seconds(table: pd.DataFrame) -> Figure:
         )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_xlabel("processor seconds of the fit")
+    axes.set_xlabel(f"processor seconds of the fit{_published(table)}")
     axes.set_ylabel("relative error of the coefficients, E2")
     axes.grid(alpha=0.25)
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)

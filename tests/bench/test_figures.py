@@ -10,8 +10,9 @@ import pandas as pd
 from PIL import Image
 
 from latticebench.bench.colours import SERIES
-from latticebench.bench.figures import draw_all, error_against_noise, panel
+from latticebench.bench.figures import draw_all, error_against_noise, errors, panel
 from latticebench.bench.fitting import FitCase
+from latticebench.bench.tables import SCORES
 from latticebench.bench.worker import outcome
 
 
@@ -64,6 +65,26 @@ def test_every_figure_is_written_with_its_provenance(tmp_path: Path) -> None:
         assert matplotlib.image.imread(path).std() > 0.01
         with Image.open(path) as image:
             assert "command: latticebench run x" in image.text["Description"]
+
+
+def test_methods_of_equal_errors_hide_none_of_one_another_and_an_asterisk_is_explained() -> None:
+    rows = [
+        {
+            "part": "", "data": data, "library": "lib1", "method": method, "noise": 0.0, "seed": 1, "status": "ok",
+            "e2": 0.1,
+        }
+        for data in ("phi4", "dnls") for method in ("a", "b*", "c*")
+    ]  # fmt: skip
+    table = pd.DataFrame(rows).reindex(columns=[*rows[0], *(score for score in SCORES if score != "e2")])
+    axes = errors(table).axes[0]
+    marks = [line for line in axes.lines if line.get_marker() not in ("None", None, "")]
+    heights = sorted(float(place) for line in marks for place in line.get_ydata())
+    assert len(heights) == 6
+    assert min(np.diff(heights)) > 0.2
+    assert [round(place) for place in heights] == [0, 0, 0, 1, 1, 1]
+    assert "published" not in axes.get_xlabel()
+    told = table.assign(published=table["method"].str.endswith("*").map({True: "abc", False: ""}))
+    assert "* published, commit abc" in errors(told).axes[0].get_xlabel()
 
 
 def test_error_against_noise_has_a_line_a_method_and_the_bound_as_its_dashed_floor() -> None:
