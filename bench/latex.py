@@ -52,6 +52,7 @@ CAPTIONS = {
     "summary": "Scores of each method, medians over the seeds.",
     "against": "Cases won, lost and tied by E2; median ratio of E2 with its 95 % interval by a bootstrap over the "
     "cases; p of the signed-rank test after Holm's correction.",
+    "against-cases": "Ratio of E2 of two methods in each case, the median over the seeds with its 95 % interval.",
     "paired": "Which of two methods has the smaller E2: signed-rank test over cases and seeds, p after Holm's "
     "correction.",
 }  # fmt: skip

@@ -31,8 +31,9 @@ def compare(
     out: Annotated[
         Path | None,
         typer.Option(
-            parser=place, metavar="FILE",
-            help="With --against: mean ranks as .png, .svg or .pdf, or wins and losses as .csv, .md or .tex.",
+            parser=place, metavar="OUT",
+            help="With --against: mean ranks as .png, .svg or .pdf, wins and losses as .csv, .md or .tex; or a folder "
+            "for all of them, with one row per case and method.",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
@@ -94,7 +95,7 @@ def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path |
     from latticebench.bench.provenance import command_line, commit
     from latticebench.bench.tables import read_cases
 
-    if out is not None and out.suffix.lower() not in (*IMAGES, *TABLES):
+    if out is not None and out.suffix.lower() not in (*IMAGES, *TABLES, ""):
         raise unknown("ending", out.suffix, (*IMAGES, *TABLES), f"--out {out}")
     table = read_cases(run)
     about = {"command": command_line(), "commit": commit()}
@@ -105,8 +106,8 @@ def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path |
     found = against(table, reference)
     _show(found)
     if out is not None:
-        _write(found, out, about)
-        print(out)
+        for path in _write(found, out, about):
+            print(path)
 
 
 def _show(found: Contest) -> None:
@@ -128,15 +129,26 @@ def _show(found: Contest) -> None:
     )
 
 
-def _write(found: Contest, out: Path, about: dict[str, Any]) -> None:
-    from latticebench.bench.figures import IMAGES, save
+def _write(found: Contest, out: Path, about: dict[str, Any]) -> list[Path]:
+    """Write mean ranks into a figure, wins and losses into a table, or all that there is into a folder.
+
+    Raises:
+        InputError: there are no mean ranks for the figure, or a file cannot be written.
+    """
+    from latticebench.bench.figures import save
     from latticebench.bench.publish import render
     from latticebench.bench.ranking import draw_ranks
     from latticebench.systems.files import write_text
 
-    if out.suffix.lower() in IMAGES:
-        if found.ranks is None:
-            raise InputError(f"--out {out}: there are no mean ranks to draw; they need three methods and two cases")
-        save(draw_ranks(found.ranks), out, about)
-    else:
-        write_text(out, render(found.methods, about, out.suffix.lower()[1:], "against"))
+    files = [out] if out.suffix else [out / f"{name}{form}" for name in ("against", "against-cases") for form in TABLES]
+    if not out.suffix and found.ranks is not None:
+        files.append(out / "ranks.png")
+    for path in files:
+        if path.suffix.lower() in TABLES:
+            frame = found.cases if path.stem == "against-cases" else found.methods
+            write_text(path, render(frame, about, path.suffix.lower()[1:], path.stem))
+        elif found.ranks is None:
+            raise InputError(f"--out {path}: there are no mean ranks to draw; they need three methods and two cases")
+        else:
+            save(draw_ranks(found.ranks), path, about)
+    return files

@@ -253,6 +253,11 @@ def test_a_method_in_one_file_stands_beside_the_paper_after_three_commands(tmp_p
     assert (tmp_path / "ranks.svg").read_text().startswith("<?xml")
     succeed("compare", "mine", "--with", paper, "--against", "mine", "--out", "against.csv", cwd=tmp_path)
     assert "published: results/paper" in (tmp_path / "against.csv").read_text()
+    written = succeed("compare", "mine", "--with", paper, "--against", "mine", "--out", "all", cwd=tmp_path).split()
+    assert {Path(path).name for path in written if path.startswith("all")} == {
+        "ranks.png", *(f"{name}.{form}" for name in ("against", "against-cases") for form in ("csv", "md", "tex"))
+    }  # fmt: skip
+    assert (tmp_path / "all" / "against-cases.csv").read_text().count("\n1a,phi4 C=2 v=0.5,lib1,") == 7
     bad = latticebench("figures", "mine", "--only", "errors", "--out", "errors.gif", cwd=tmp_path)
     assert (bad.returncode, "unknown ending '.gif'" in bad.stderr) == (2, True)
     lone = latticebench("table", "mine", "--with", root / "results" / "limits", cwd=tmp_path)
