@@ -260,6 +260,8 @@ def test_a_method_in_one_file_stands_beside_the_paper_after_three_commands(tmp_p
     assert (tmp_path / "all" / "against-cases.csv").read_text().count("\n1a,phi4 C=2 v=0.5,lib1,") == 7
     bad = latticebench("figures", "mine", "--only", "errors", "--out", "errors.gif", cwd=tmp_path)
     assert (bad.returncode, "unknown ending '.gif'" in bad.stderr) == (2, True)
+    both = latticebench("table", "mine", "--with", paper, "--json", cwd=tmp_path)
+    assert (both.returncode, both.stdout, "take the CSV files of --out" in both.stderr) == (2, "", True)
     lone = latticebench("table", "mine", "--with", root / "results" / "limits", cwd=tmp_path)
     assert (lone.returncode, "it has none of these cases" in lone.stderr) == (2, True)
 
