@@ -195,16 +195,26 @@ def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Predi
     of_u = best.fitted.rms[: search.problem.chain.sites]
     least = rules.BEYOND_NOISE * float(np.sqrt(np.nanmean(of_u**2))) / search.problem.height
     while best.fitted.model.effects and now > max((1 + rules.WORSE) * before, least):
-        search.say("the forecast is worse than before: trying without the weakest effect")
-        weakest = int(np.argmin(best.evidence))
-        fitted = search.without(best.fitted, weakest)
-        error = np.inf if fitted is None else pooled(foreseen(fitted))
-        if fitted is None or not error < now:
+        search.say("the forecast is worse than before: trying without each effect, the weakest first")
+        found = _with_one_less(search, best, now, foreseen)
+        if found is None:
             break
-        kept = [k for k in range(len(best.evidence)) if k != weakest]
-        evidence = tuple(best.evidence[k] for k in kept)
-        best, now = Compared(fitted, evidence, tuple(best.alternatives[k] for k in kept)), error
+        best, now = found
     return best
+
+
+def _with_one_less(
+    search: Search, best: Compared, now: float, foreseen: Callable[[Fitted], list[Prediction]]
+) -> tuple[Compared, float] | None:
+    """Return a model without the weakest effect that makes the forecast worse, and its error; None where none does."""
+    for number in np.argsort(best.evidence):
+        fitted = search.without(best.fitted, int(number))
+        error = np.inf if fitted is None else pooled(foreseen(fitted))
+        if fitted is not None and error < now:
+            kept = [k for k in range(len(best.evidence)) if k != number]
+            evidence, alternatives = (tuple(one[k] for k in kept) for one in (best.evidence, best.alternatives))
+            return Compared(fitted, evidence, alternatives), error
+    return None
 
 
 def _diagnosis(

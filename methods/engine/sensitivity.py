@@ -354,7 +354,7 @@ class Stretches:
             target[own : own + terms, -1] += np.transpose(values, (1, 0, 3, 2))
 
     def _jacobian(self, slopes: dict[tuple[int, Slot], ndarray], batch: int) -> Float[ndarray, "batch rate state"]:
-        """Return the derivatives of the highest rates (parts and sites) by the states, for sites that couple to many."""
+        """Return the derivatives of the highest rates (parts, sites) by the states, for sites that couple to many."""
         dynamics, sites = self.dynamics, np.arange(self.dynamics.count)
         found = np.zeros((batch, dynamics.parts, dynamics.count, dynamics.order, dynamics.parts, dynamics.count))
         for (part, slot), slope in slopes.items():
