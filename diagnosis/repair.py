@@ -212,8 +212,8 @@ def _with_one_less(
         error = np.inf if fitted is None else pooled(foreseen(fitted))
         if fitted is not None and error < now:
             kept = [k for k in range(len(best.evidence)) if k != number]
-            evidence, alternatives = (tuple(one[k] for k in kept) for one in (best.evidence, best.alternatives))
-            return Compared(fitted, evidence, alternatives), error
+            evidence = tuple(best.evidence[k] for k in kept)
+            return Compared(fitted, evidence, tuple(best.alternatives[k] for k in kept)), error
     return None
 
 
