@@ -196,10 +196,10 @@ def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Predi
     least = rules.BEYOND_NOISE * float(np.sqrt(np.nanmean(of_u**2))) / search.problem.height
     while best.fitted.model.effects and now > max((1 + rules.WORSE) * before, least):
         search.say("the forecast is worse than before: trying without each effect, the weakest first")
-        found = _with_one_less(search, best, now, foreseen)
-        if found is None:
+        better = _with_one_less(search, best, now, foreseen)
+        if better is None:
             break
-        best, now = found
+        best, now = better
     return best
 
 
