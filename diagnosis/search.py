@@ -22,7 +22,7 @@ from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure, estimate
 from latticebench.diagnosis.problem import Problem, regressed, turned
 from latticebench.diagnosis.score import Scored, Tangent
-from latticebench.diagnosis.worth import COUPLING, Worth, beyond, misfits, repelling, same, wald
+from latticebench.diagnosis.worth import COUPLING, Worth, beyond, misfits, over, repelling, same, wald
 
 Watcher = Callable[[str], None]
 
@@ -140,7 +140,10 @@ class Search:
     def _at_once(self) -> bool:
         """Return whether the declared equation alone nearly follows the longest pieces; short ones are not needed."""
         found = self._begun(self._declared, self.problem, self.layout(self._longest), CHANGED)
-        return found is not None and found.converged and beyond(self.problem, found) < rules.AT_ONCE
+        if found is None or not found.converged:
+            return False
+        ratio = over(self.problem, found)
+        return bool(np.any(np.isfinite(ratio))) and float(np.sqrt(np.nanmean(ratio**2))) < rules.AT_ONCE
 
     @functools.cached_property
     def _declared(self) -> Model:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,15 +14,24 @@ from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.problem import Problem
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
 COUPLING = "u[n+1]+u[n-1]-2*u[n]"
 # Models whose costs and readings differ by less (nats; share of the noise) are one model said in two ways.
 SAME_COST, SAME_READING = 0.3, 0.05
 
 
+def over(problem: Problem, fitted: Fitted) -> Float[ndarray, " sensors"]:
+    """Return how many times the noise that its readings show a model leaves at each sensor; NaN where none is known."""
+    known = problem.noise > 0
+    return np.where(known, fitted.rms / np.where(known, problem.noise, 1.0), np.nan)
+
+
 def beyond(problem: Problem, fitted: Fitted) -> float:
     """Return how many times the noise that the readings show a model leaves, at the sensor where that is most."""
-    noise = problem.noise
-    return float(np.nanmax(np.where(noise > 0, fitted.rms / noise, np.nan), initial=0.0))
+    return float(np.nanmax(over(problem, fitted), initial=0.0))
 
 
 def lost(problem: Problem, fitted: Fitted) -> bool:
