@@ -115,17 +115,15 @@ class Search:
         last: Found | None = None
         shortest = 2 * np.pi / self.problem.top / self.problem.step
         length = max(int(rules.FIRST_HORIZON * shortest), self._least)
-        if self._at_once():
-            length = self._longest
-        while length:
+        carried = self._first(length)
+        if longer := self._at_once(carried):
+            carried, length = longer, self._longest
+        while carried:
             self.lengths.append(length)
             whole = length >= self._longest
             waves = length * self.problem.step * self.problem.main / (2 * np.pi)
             late = whole or waves >= rules.PERIODS or (last is not None and misfits(self.problem, last.models[0]))
             self.open = tuple(one for one in self.problem.candidates if late or not one.timed)
-            carried = self._first(length) if last is None else self._carried(last, length)
-            if not carried:
-                break
             before, fits = carried[0], list(carried[1:])
             self.say(f"following pieces of {waves:.3g} periods")
             best = self._level(fits, before)
@@ -136,14 +134,21 @@ class Search:
             last = Found(before, tuple(best), done)
             yield last
             length = self._next(length, settled)
+            carried = self._carried(last, length) if length else []
 
-    def _at_once(self) -> bool:
-        """Return whether the declared equation alone nearly follows the longest pieces; short ones are not needed."""
-        found = self._begun(self._declared, self.problem, self.layout(self._longest), CHANGED)
+    def _at_once(self, first: list[Fitted]) -> list[Fitted]:
+        """Return the first fits on the longest pieces if the declared equation alone nearly follows these.
+
+        The parts of the noise model are those that short pieces show: on long ones, what is missing looks like noise
+        with a memory.
+        """
+        found = self._begun(self._declared, self.problem, self.layout(self._longest), CHANGED) if first else None
         if found is None or not found.converged:
-            return False
+            return []
         ratio = over(self.problem, found)
-        return bool(np.any(np.isfinite(ratio))) and float(np.sqrt(np.nanmean(ratio**2))) < rules.AT_ONCE
+        if not np.any(np.isfinite(ratio)) or np.sqrt(np.nanmean(ratio**2)) > rules.AT_ONCE:
+            return []
+        return self._carried(Found(first[0], tuple(first[1:]), ()), self._longest)
 
     @functools.cached_property
     def _declared(self) -> Model:
