@@ -1,6 +1,6 @@
 """Find the equations of motion of nonlinear lattices from data, and measure how well each method does it.
 
-For notebooks, each loaded when it is first used (`latticebench.front`):
+For notebooks, each loaded when it is first used (`latticebench.recording`, `latticebench.front`):
 
 - `read` a recording, `Model` an equation or take that of a `system`;
 - `fit` its coefficients, `diagnose` what it lacks, know the `limit` of what can be known;
@@ -26,19 +26,17 @@ if TYPE_CHECKING:
         Bound,
         Cause,
         Fitted,
-        Model,
-        Recording,
         Run,
         diagnose,
         fit,
         limit,
-        read,
         results,
         run,
-        system,
     )  # fmt: skip
+    from latticebench.recording import Model, Recording, read, system
 
 ROOMS = ("systems", "methods", "diagnosis", "bench")
+GIVEN = ("Model", "Recording", "read", "system")
 
 __all__ = [
     "Bound", "Cause", "Fitted", "Model", "Recording", "Run", "__version__", "bench", "diagnose", "diagnosis", "fit",
@@ -59,7 +57,7 @@ def __getattr__(name: str) -> Any:
     if name in ROOMS:
         return importlib.import_module(f"{__name__}.{name}")
     if name in __all__:
-        return getattr(importlib.import_module(f"{__name__}.front"), name)
+        return getattr(importlib.import_module(f"{__name__}.{'recording' if name in GIVEN else 'front'}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -1,0 +1,165 @@
+"""A recording and the equation that is declared for it; `latticebench.front` has what is done with them."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from latticebench import systems
+from latticebench.bench.inspection import Inspection
+from latticebench.bench.inspection import inspect as inspect_samples
+from latticebench.bench.report.units import in_words, units_of
+from latticebench.systems.lattice import Library, library
+from latticebench.systems.layout import Layout
+from latticebench.systems.readers import from_frame, read_all
+from latticebench.systems.samples import Samples, check_alike
+from latticebench.systems.stencil import Ends
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One or more trajectories, as `read` returns them.
+
+    Attributes:
+        samples: the trajectories.
+    """
+
+    samples: tuple[Samples, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """How the files were read, where that is not plain."""
+        return tuple(dict.fromkeys(note for one in self.samples for note in one.origin.notes))
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return times and readings, in the units of the equation, with a column `trajectory` where there are several.
+
+        >>> import latticebench as lb
+        >>> data = lb.read(([0.0, 0.1, 0.2], [[1.0, 2.0], [1.5, 2.5], [2.0, 3.0]]))
+        >>> data.to_frame()
+             t   u1   u2
+        0  0.0  1.0  2.0
+        1  0.1  1.5  2.5
+        2  0.2  2.0  3.0
+        """
+        frames = []
+        for number, one in enumerate(self.samples, 1):
+            columns: dict[str, Any] = {"trajectory": number} if len(self.samples) > 1 else {}
+            columns["t"] = one.t
+            for letter, values in (("u", one.u), ("v", one.v), ("f", one.f)):
+                if values is not None:
+                    columns |= {f"{letter}{site + 1}": values[:, site] for site in range(one.sites)}
+            frames.append(pd.DataFrame(columns))
+        return pd.concat(frames, ignore_index=True)
+
+    def inspect(self, model: Model | None = None) -> tuple[Inspection, ...]:
+        """Return what each trajectory is like, and what is suspicious; see `latticebench inspect`."""
+        return tuple(inspect_samples(one, None if model is None else model.library) for one in self.samples)
+
+    def __repr__(self) -> str:
+        first, units = self.samples[0], in_words(units_of(self.samples[0].origin))
+        rows = sum(len(one.t) for one in self.samples)
+        parts = [f"{first.source}: {first.sites} sites, {rows} rows", f"{len(self.samples)} trajectories"]
+        parts = [*parts[: 1 + (len(self.samples) > 1)], *([units] if units else []), *self.notes]
+        return f"Recording({'; '.join(parts)})"
+
+    def _repr_html_(self) -> str:
+        table = self.to_frame().head().to_html(index=False, float_format="{:.5g}".format, border=0)
+        return f"<p>{html.escape(repr(self))}</p>{table}"
+
+
+def read(
+    source: str | Path | Sequence[str | Path] | pd.DataFrame | tuple[ArrayLike, ArrayLike],
+    *,
+    time: str | None = None,
+    columns: str | Sequence[str] = (),
+    scale: str | float = 1.0,
+    sort: bool = False,
+) -> Recording:
+    """Read a recording.
+
+    Args:
+        source: a file (.csv, .txt, .tsv, .dat, .xlsx, .parquet, .npz) or several; a DataFrame; or a pair of arrays,
+            times (T,) and readings (T, sites).
+        time: the column of the times; "t" if not given.
+        columns: the columns of u by site: a pattern such as "theta_*_deg", or names; u1, u2, ... if not given.
+        scale: what one unit of a reading is in the equation: a number, or the unit of the readings such as "deg".
+        sort: sort rows by their times, and average rows of the same time.
+
+    Raises:
+        InputError: it cannot be read; the message says where, and what would read it.
+
+    Examples:
+        >>> import latticebench as lb
+        >>> import pandas as pd
+        >>> table = pd.DataFrame({"time_s": [0.0, 0.1], "theta_1_deg": [0.0, 90.0], "remark": ["a", "b"]})
+        >>> data = lb.read(table, time="time_s", columns="theta_*_deg", scale="deg")
+        >>> data.to_frame().round(3)
+             t     u1
+        0  0.0  0.000
+        1  0.1  1.571
+        >>> data.notes[-1]
+        'not read: remark'
+    """
+    chosen = (columns,) if isinstance(columns, str) else tuple(columns)
+    layout = Layout(time, chosen, str(scale), sort)
+    if isinstance(source, pd.DataFrame):
+        return Recording(tuple(from_frame(source, "table", "unknown", layout)))
+    if isinstance(source, tuple) and len(source) == 2 and not isinstance(source[0], (str, Path)):
+        u = np.asarray(source[1]) * layout.factor
+        return Recording((Samples(np.asarray(source[0], float), u[:, None] if u.ndim == 1 else u, source="arrays"),))
+    paths = [source] if isinstance(source, (str, Path)) else list(source)
+    return Recording(tuple(read_all([Path(str(one)) for one in paths], "unknown", layout)))
+
+
+@dataclass(frozen=True)
+class Model:
+    """An equation of motion with free coefficients.
+
+    Attributes:
+        terms: the terms, with ; between them.
+        order: of the time derivative, 1 or 2.
+        ends: how the chain ends: unknown, free, fixed, periodic or antiperiodic.
+
+    >>> import latticebench as lb
+    >>> lb.Model("u[n+1]+u[n-1]-2*u[n]; sin(u[n])", order=2, ends="free")
+    Model("u[n+1]+u[n-1]-2*u[n]; sin(u[n])", order=2, ends="free")
+    """
+
+    terms: str
+    order: Literal[1, 2] = 2
+    ends: Ends = "unknown"
+
+    @property
+    def library(self) -> Library:
+        """The terms, read."""
+        return library("terms", self.terms)
+
+    def of(self, data: Recording) -> list[Samples]:
+        """Return recordings with the ends of this model."""
+        found = [replace(one, ends=self.ends) for one in data.samples]
+        check_alike(found)
+        return found
+
+    def __repr__(self) -> str:
+        return f'Model("{self.terms}", order={self.order}, ends="{self.ends}")'
+
+
+def system(name: str, library: str = "equation") -> Model:
+    """Return the equation of a system, or one of its libraries, as a model.
+
+    >>> import latticebench as lb
+    >>> lb.system("phi4")
+    Model("u[n+1]+u[n-1]-2*u[n]; u[n]; u[n]**3", order=2, ends="free")
+    """
+    found = systems.find(name)
+    return Model("; ".join(found.library(library).texts), found.order, found.ends)
