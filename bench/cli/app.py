@@ -29,6 +29,7 @@ from latticebench.bench.cli import (
     listing,
     merge,
     plot,
+    publish,
     run,
     schema,
     simulate,
@@ -84,6 +85,7 @@ app.command(epilog=run.EPILOG)(run.run)
 app.command(epilog=merge.EPILOG)(merge.merge)
 app.command(epilog=table.EPILOG)(table.table)
 app.command(epilog=figures.EPILOG)(figures.figures)
+app.command(epilog=publish.EPILOG)(publish.publish)
 app.command(epilog=compare.EPILOG)(compare.compare)
 app.command(epilog=limit.EPILOG)(limit.limit)
 app.command(epilog=plot.EPILOG)(plot.plot)

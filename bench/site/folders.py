@@ -1,0 +1,202 @@
+"""What lies in a folder of published results: tables, texts, pictures, diagnoses, and other files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import math
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pydantic
+
+from latticebench.bench.escape import csv_text
+from latticebench.bench.report.content import DiagnosisDocument
+from latticebench.bench.store import is_store
+from latticebench.systems.errors import InputError, printable
+from latticebench.systems.files import DATA, check_regular, read_json, read_text, reading, shown
+
+# What programs leave beside files.
+LEFT_OUT = ("__pycache__",)
+PNG = b"\x89PNG\r\n\x1a\n"
+# A folder within a folder within ... is no folder of results.
+MOST_NESTED = 5
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a CSV file, each cell as it is there.
+
+    Attributes:
+        columns: the header.
+        rows: cells, as many in each as there are columns.
+        about: the lines above the header, in two parts: what it is, and what is said of it ("command", ...).
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    about: tuple[tuple[str, str], ...] = ()
+
+    def column(self, name: str) -> list[str]:
+        """Return the cells of a column."""
+        place = self.columns.index(name)
+        return [row[place] for row in self.rows]
+
+    def records(self) -> Iterator[dict[str, str]]:
+        """Yield each row by the names of the columns."""
+        return (dict(zip(self.columns, row, strict=True)) for row in self.rows)
+
+    def has(self, *names: str) -> bool:
+        """Return whether there are columns of these names."""
+        return set(names) <= set(self.columns)
+
+    def said(self, name: str) -> str:
+        """Return what the lines above the header say of something; nothing where they do not."""
+        return dict(self.about).get(name, "")
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A folder of published results, by the names of its files without their endings.
+
+    Attributes:
+        path: where it is.
+        parts: its name in the site, and those of the folders around it.
+        files: the names of all its files.
+        tables: of the CSV files.
+        texts: of Markdown files that are more than another form of a table.
+        pictures: PNG and SVG files by their whole names, with width and height in pixels (0 where it is not known).
+        diagnoses: of JSON files.
+        folders: within it.
+    """
+
+    path: Path
+    parts: tuple[str, ...]
+    files: tuple[str, ...]
+    tables: Mapping[str, Table]
+    texts: Mapping[str, str]
+    pictures: Mapping[str, tuple[int, int]]
+    diagnoses: Mapping[str, DiagnosisDocument]
+    folders: tuple[Folder, ...]
+
+    @property
+    def name(self) -> str:
+        """Its name in the site, with those of the folders around it."""
+        return "/".join(self.parts)
+
+
+def read_folder(path: Path, parts: tuple[str, ...]) -> Folder:
+    """Read a folder of published results with all that is in it.
+
+    Args:
+        path: the folder.
+        parts: its name in the site, and those of the folders around it.
+
+    Raises:
+        InputError: it is no such folder, has nothing in it, or a file of it is damaged.
+    """
+    if not path.is_dir():
+        missing = "no such folder" if not path.exists() else "a file, not a folder of published tables"
+        raise InputError(f"{shown(path)}: {missing}")
+    if is_store(path):
+        told = f"latticebench table {shown(path)} --out results/{shown(path.name)}"
+        raise InputError(f"{shown(path)}: results of a run; publish their tables first: {told}")
+    if len(parts) > MOST_NESTED:
+        raise InputError(f"{shown(path)}: folders within folders, more than {MOST_NESTED} deep; give those with tables")
+    inside = sorted(one for one in path.iterdir() if not one.name.startswith(".") and one.name not in LEFT_OUT)
+    files = [one for one in inside if not one.is_dir()]
+    folders = tuple(read_folder(one, (*parts, printable(one.name))) for one in inside if one.is_dir())
+    if not inside:
+        raise InputError(f"{shown(path)}: there is nothing in it; give a folder of `latticebench table DIR --out`")
+    for one in files:
+        if one.name != printable(one.name):
+            raise InputError(f"{shown(one)}: a name with signs that cannot be shown; rename it")
+        check_regular(one)
+    by_ending = {ending: [one for one in files if one.suffix.lower() == ending] for ending in ENDINGS}
+    texts = {one.stem: read_text(one) for one in by_ending[".md"]}
+    diagnoses = {one.stem: read_diagnosis(one) for one in by_ending[".json"]}
+    return Folder(
+        path, parts, tuple(one.name for one in files), {one.stem: read_table(one) for one in by_ending[".csv"]},
+        {stem: text for stem, text in texts.items() if not text.lstrip().startswith("|")},
+        {one.name: png_size(one) for one in by_ending[".png"]} | {one.name: (0, 0) for one in by_ending[".svg"]},
+        {stem: found for stem, found in diagnoses.items() if found is not None}, folders,
+    )  # fmt: skip
+
+
+ENDINGS = (".csv", ".md", ".json", ".png", ".svg")
+
+
+def read_table(path: Path) -> Table:
+    """Read a published table.
+
+    Raises:
+        InputError: it is none, or cells are missing; the message names the row.
+    """
+    text = read_text(path, DATA).splitlines(keepends=True)
+    head = list(itertools.takewhile(lambda line: line.startswith("#"), text))
+    parts = (line.removeprefix("#").strip().partition(": ") for line in head)
+    about = tuple((name, value) if value else ("note", name) for name, _, value in parts)
+    try:
+        # Later sharp signs are part of a cell.
+        rows = [tuple(map(csv_text, row)) for row in csv.reader(io.StringIO("".join(text[len(head) :])), strict=True)]
+    except csv.Error as error:
+        raise InputError(f"{shown(path)}: not a table: {error}") from None
+    if not rows or not all(rows[0]):
+        raise InputError(f"{shown(path)}: not a table: the names of its columns are missing")
+    columns = rows[0]
+    if twice := [name for name in columns if columns.count(name) > 1]:
+        raise InputError(f"{shown(path)}: not a table: two columns are called {printable(twice[0])!r}")
+    for number, row in enumerate(rows[1:], 1):
+        if len(row) != len(columns):
+            raise InputError(
+                f"{shown(path)}: row {number}: {len(row)} cells under {len(columns)} columns; publish the table again"
+            )
+    return Table(columns, tuple(rows[1:]), about)
+
+
+def read_diagnosis(path: Path) -> DiagnosisDocument | None:
+    """Read the JSON document of a diagnosis; None where it is another document.
+
+    Raises:
+        InputError: it is no JSON, or says that it is a diagnosis and is none.
+    """
+    found = read_json(path)
+    if not isinstance(found, dict) or found.get("schema") != DiagnosisDocument.model_fields["schema_"].default:
+        return None
+    try:
+        return DiagnosisDocument.model_validate(found)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise InputError(f"{shown(path)}: not a whole diagnosis: {printable(place)}: {first['msg']}") from None
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    """Return width and height of a PNG in pixels.
+
+    Raises:
+        InputError: it is none.
+    """
+    with reading(path, DATA) as file:
+        head = file.read(24)
+    if len(head) < 24 or not head.startswith(PNG):
+        raise InputError(f"{shown(path)}: not a PNG; draw it again")
+    width, height = struct.unpack(">II", head[16:])
+    return int(width), int(height)
+
+
+def value_of(cell: str) -> float:
+    """Return the number that a cell holds; NaN where it holds none."""
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
+
+
+def is_numeric(cells: list[str]) -> bool:
+    """Return whether a column holds numbers, and nothing else but empty cells."""
+    filled = [cell for cell in cells if cell]
+    return bool(filled) and not any(math.isnan(value_of(cell)) and cell.lower() != "nan" for cell in filled)
