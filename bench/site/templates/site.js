@@ -234,7 +234,7 @@
       if (across === "noise") parts.push(...this.medians(sx, sy, held, up, frame));
       const faint = this.points.length > 60 && across === "noise" ? 0.3 : 0.9;
       for (const p of this.points) {
-        if (up === "e2" && this.points.length <= 150) parts.push(...this.spread(p, sy, held));
+        if (up === "e2" && this.points.length <= 150) parts.push(...this.spread(p, sy, held, frame.top));
         parts.push(this.mark(p.method, p.left, p.top, { opacity: faint, class: "point" }));
       }
       this.points.sort((a, b) => a.left - b.left || a.top - b.top);
@@ -274,10 +274,10 @@
       return parts;
     }
 
-    spread(p, sy, held) {
+    spread(p, sy, held, rim) {
       const cells = this.shown.data.rows[p.row], { place } = this.shown;
       if (!("e2_low" in place) || cells[place.e2_low] === "") return [];
-      const ends = ["e2_low", "e2_high"].map((name) => sy.at(held(number(cells[place[name]]))));
+      const ends = ["e2_low", "e2_high"].map((name) => number(cells[place[name]])).map((y) => (Number.isFinite(y) ? sy.at(held(y)) : rim));
       const colour = this.about.methods[this.methods.indexOf(p.method)][1];
       return [draw("path", { d: `M${p.left} ${ends[0]}V${ends[1]}`, stroke: colour, "stroke-width": 1.2, opacity: 0.6 })];
     }
