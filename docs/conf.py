@@ -63,6 +63,7 @@ sphinx_gallery_conf = {
     "remove_config_comments": True,
     "download_all_examples": False,
     "image_scrapers": ("matplotlib",),
+    "matplotlib_animations": True,
     "plot_gallery": True,
     "capture_repr": (),
 }

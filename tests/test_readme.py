@@ -23,7 +23,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("*.md"))}
 COMMANDS = {name: re.findall(r"^```\{command-output\} (.*)$", text, re.MULTILINE) for name, text in PAGES.items()}
 # Pages whose commands take seconds; those of the others take up to a minute.
-QUICK = ("start", "system", "protocol")
+QUICK = ("start", "system", "protocol", "site")
 Run = Callable[[str, Path], str]
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
