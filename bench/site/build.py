@@ -31,8 +31,8 @@ def build(given: Sequence[Path], out: Path, about: Mapping[str, Any]) -> list[st
     Raises:
         InputError: a folder is none of published results, or is damaged; or the site cannot be written there.
     """
-    folders = read(given)
     check_place(out, given)
+    folders = read(given)
     with _fresh(out) as site:
         written = {path: text.encode(errors="backslashreplace") for path, text in pages(folders, about)}
         for path, content in written.items():
@@ -71,7 +71,7 @@ def check_place(out: Path, given: Sequence[Path]) -> None:
         source = Path(os.path.realpath(one))
         if source == place or source in place.parents or place in source.parents:
             raise InputError(f"--out {shown(out)}: it lies in {shown(one)}, or that in it; write to another folder")
-    if not place.exists():
+    if not os.path.lexists(place):
         return
     if not place.is_dir():
         raise InputError(f"--out {shown(out)}: a file, not a folder; give another name")
@@ -102,7 +102,7 @@ def _fresh(out: Path) -> Iterator[Path]:
         new, old = made[0] / "new", made[0] / "old"
         new.mkdir()
         yield new
-        if target.exists():
+        if os.path.lexists(target):
             target.replace(old)
         try:
             new.replace(target)

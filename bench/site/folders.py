@@ -6,6 +6,7 @@ import csv
 import io
 import itertools
 import math
+import os
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ LEFT_OUT = ("__pycache__",)
 PNG = b"\x89PNG\r\n\x1a\n"
 # A folder within a folder within ... is no folder of results.
 MOST_NESTED = 5
+MOST_FILES = 10_000
 
 
 @dataclass(frozen=True)
@@ -98,22 +100,18 @@ def read_folder(path: Path, parts: tuple[str, ...]) -> Folder:
     Raises:
         InputError: it is no such folder, has nothing in it, or a file of it is damaged.
     """
-    if not path.is_dir():
-        missing = "no such folder" if not path.exists() else "a file, not a folder of published tables"
+    if not os.path.isdir(path):
+        missing = "a file, not a folder of published tables" if os.path.lexists(path) else "no such folder"
         raise InputError(f"{shown(path)}: {missing}")
     if is_store(path):
         told = f"latticebench table {shown(path)} --out results/{shown(path.name)}"
         raise InputError(f"{shown(path)}: results of a run; publish their tables first: {told}")
     if len(parts) > MOST_NESTED:
         raise InputError(f"{shown(path)}: folders within folders, more than {MOST_NESTED} deep; give those with tables")
-    inside = sorted(one for one in path.iterdir() if not one.name.startswith(".") and one.name not in LEFT_OUT)
-    files = [one for one in inside if not one.is_dir()]
-    folders = tuple(read_folder(one, (*parts, printable(one.name))) for one in inside if one.is_dir())
-    if not inside:
-        raise InputError(f"{shown(path)}: there is nothing in it; give a folder of `latticebench table DIR --out`")
+    files = _inside(path)
+    folders = tuple(read_folder(one, (*parts, one.name)) for one in files if os.path.isdir(one))
+    files = [one for one in files if not os.path.isdir(one)]
     for one in files:
-        if one.name != printable(one.name):
-            raise InputError(f"{shown(one)}: a name with signs that cannot be shown; rename it")
         check_regular(one)
     by_ending = {ending: [one for one in files if one.suffix.lower() == ending] for ending in ENDINGS}
     texts = {one.stem: read_text(one) for one in by_ending[".md"]}
@@ -127,6 +125,24 @@ def read_folder(path: Path, parts: tuple[str, ...]) -> Folder:
 
 
 ENDINGS = (".csv", ".md", ".json", ".png", ".svg")
+
+
+def _inside(path: Path) -> list[Path]:
+    """Return what a folder holds, by name.
+
+    Raises:
+        InputError: it cannot be read, is empty, holds too much, or a name has signs that cannot be shown.
+    """
+    try:
+        names = sorted(name for name in os.listdir(path) if not name.startswith(".") and name not in LEFT_OUT)
+    except OSError as error:
+        raise InputError(f"{shown(path)}: {error.strerror}") from None
+    if not 0 < len(names) <= MOST_FILES:
+        held = f"more than {MOST_FILES} files are" if names else "there is nothing"
+        raise InputError(f"{shown(path)}: {held} in it; give a folder of `latticebench table DIR --out`")
+    if odd := [name for name in names if name != printable(name)]:
+        raise InputError(f"{shown(path / odd[0])}: a name with signs that cannot be shown; rename it")
+    return [path / name for name in names]
 
 
 def read_table(path: Path) -> Table:

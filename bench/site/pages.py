@@ -220,8 +220,7 @@ def _made(folder: Folder) -> list[tuple[str, tuple[tuple[str, str], ...]]]:
     """Return by what each table was made; tables that were made alike stand together."""
     found: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for stem, table in folder.tables.items():
-        if table.about:
-            found.setdefault(table.about, []).append(stem)
+        found.setdefault(table.about, []).append(stem)
     return [(", ".join(stems), about) for about, stems in found.items()]
 
 

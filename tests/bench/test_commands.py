@@ -71,6 +71,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "compare": (("store", "store"), ("--factor", "--json")), "schema": ((), ("--out",)), "data": ((), ("--json",)),
     "list": (("systems",), ("--json",)),
     "plot": (("t.csv", "--only", "map", "--out", "x.svg"), ("--out", "--animate", "--only", "--trajectory")),
+    "publish": (("tables", "--out", "site"), ("--out",)),
     "run": (("s.toml", "--jobs", "1", "--results", "store"), ("--jobs", "--results", "--shard", "--data", "--json")),
 }  # fmt: skip
 
@@ -94,6 +95,7 @@ def odd_command(draw: random.Random) -> list[str]:
 def survive_commands(folder: Path, seeds: range) -> None:
     (folder / "s.toml").write_text(SUITE)
     latticebench("run", "s.toml", "--jobs", "1", "--results", "store", cwd=folder)
+    latticebench("table", "store", "--out", "tables", cwd=folder)
     for name in ("t.csv", "t.npz"):
         latticebench("simulate", "phi4", "--sites", "5", "--samples", "12", "--out", name, cwd=folder)
     os.mkfifo(folder / "pipe.csv")
