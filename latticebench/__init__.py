@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from latticebench.recording import Model, Recording, read, system
 
 ROOMS = ("systems", "methods", "diagnosis", "bench")
+# What lies in `latticebench.recording`; the other functions and classes lie in `latticebench.front`.
 GIVEN = ("Model", "Recording", "read", "system")
 
 __all__ = [
