@@ -19,7 +19,7 @@
   };
   const make = (name, attributes = {}, ...children) => fill(document.createElement(name), attributes, children);
   const draw = (name, attributes = {}, ...children) => fill(document.createElementNS(SVG, name), attributes, children);
-  const number = (text) => (/^-?inf$/.test(text) ? Number(text.replace("inf", "Infinity")) : text === "" ? NaN : Number(text));
+  const number = (text) => (text === "" ? NaN : Number(text.replace(/^(-?)inf$/, "$1Infinity")));
   const brief = (value) => (Number.isFinite(value) ? String(Number(value.toPrecision(3))) : "none");
 
   const dialog = make("dialog", { "aria-labelledby": "told" });
@@ -98,7 +98,8 @@
       head.setAttribute("aria-sort", down ? "descending" : "ascending");
       const numeric = this.data.columns[k][2], sign = down ? -1 : 1;
       const empty = (cell) => (numeric ? Number.isNaN(number(cell)) : cell === "");
-      const less = (a, b) => (numeric ? (a === b ? 0 : number(a) - number(b)) : a.localeCompare(b, "en", { numeric: true }));
+      // Infinity less infinity is no number.
+      const less = (a, b) => (numeric ? number(a) - number(b) || 0 : a.localeCompare(b, "en", { numeric: true }));
       // What is not known comes last either way.
       this.order.sort((one, other) => {
         const a = this.data.rows[one][k], b = this.data.rows[other][k];
@@ -155,7 +156,8 @@
       this.methods = this.about.methods.map(([name]) => name);
       this.x = this.pick("horizontal axis", this.about.x, this.about.first);
       this.y = this.pick("vertical axis", this.about.y.map(([name]) => name), this.about.y[0][0]);
-      this.svg = draw("svg", { tabindex: 0, role: "group", "aria-label": "Figure; arrow keys go from point to point, Enter tells how one was made" });
+      const label = "Figure; arrow keys go from point to point, Enter tells how one was made";
+      this.svg = draw("svg", { tabindex: 0, role: "group", "aria-label": label });
       this.told = make("output", {}, "");
       const controls = make("div", { class: "choose" }, this.x.label, this.y.label);
       const place = box.querySelector(".wide");
@@ -185,9 +187,8 @@
     }
 
     mark(method, x, y, extra = {}) {
-      const k = this.methods.indexOf(method);
-      const attributes = { d: MARKS[k % MARKS.length], fill: this.about.methods[k][1], transform: `translate(${x} ${y})` };
-      return draw("path", { ...attributes, ...extra });
+      const k = this.methods.indexOf(method), transform = `translate(${x} ${y})`;
+      return draw("path", { d: MARKS[k % MARKS.length], fill: this.about.methods[k][1], transform, ...extra });
     }
 
     legend() {
@@ -226,7 +227,9 @@
       this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
       this.svg.setAttribute("height", height);
       const parts = [...axes(sx, sy, frame, columns[place[across]][1], columns[place[up]][1])];
-      const offset = (method) => (across === "noise" ? (this.methods.indexOf(method) - (this.methods.length - 1) / 2) * 3 : 0);
+      // At one level of noise the methods stand side by side.
+      const apart = across === "noise" ? 3 : 0, middle = (this.methods.length - 1) / 2;
+      const offset = (method) => (this.methods.indexOf(method) - middle) * apart;
       for (const p of this.points) {
         p.left = sx.at(p.x) + offset(p.method);
         p.top = Number.isFinite(p.y) ? sy.at(held(p.y)) : frame.top;
@@ -238,7 +241,8 @@
         parts.push(this.mark(p.method, p.left, p.top, { opacity: faint, class: "point" }));
       }
       this.points.sort((a, b) => a.left - b.left || a.top - b.top);
-      this.ring = draw("circle", { r: 8, fill: "none", stroke: this.about.ink, "stroke-width": 2, visibility: "hidden" });
+      const ring = { r: 8, fill: "none", stroke: this.about.ink, "stroke-width": 2, visibility: "hidden" };
+      this.ring = draw("circle", ring);
       this.svg.replaceChildren(...parts, this.ring);
       this.at = 0;
       this.told.textContent = this.points.length ? this.caption(across) : "No row that is chosen has such a point.";
@@ -246,7 +250,8 @@
 
     caption(across) {
       const lines = "Lines are medians over those of the chosen rows whose data have several levels of noise. ";
-      return `${across === "noise" ? lines : ""}A point at the upper rim has no result, and errors below ${LOWEST} share the lowest place. Choose a point to see how it was made.`;
+      const rims = `A point at the upper rim has no result, and errors below ${LOWEST} share the lowest place. `;
+      return `${across === "noise" ? lines : ""}${rims}Choose a point to see how it was made.`;
     }
 
     medians(sx, sy, held, up, frame) {
@@ -260,16 +265,19 @@
           const middle = sorted.length / 2, y = (sorted[Math.ceil(middle) - 1] + sorted[Math.floor(middle)]) / 2;
           return `${k ? "L" : "M"}${sx.at(level) + points[0].shift} ${Number.isFinite(y) ? sy.at(held(y)) : frame.top}`;
         });
-        if (xs.length > 1) parts.push(draw("path", { d: path.join(""), stroke: colour, fill: "none", "stroke-width": 2, ...extra }));
+        const drawn = { d: path.join(""), stroke: colour, fill: "none", "stroke-width": 2, ...extra };
+        if (xs.length > 1) parts.push(draw("path", drawn));
       };
       this.about.methods.forEach(([method, colour, again]) => {
         const points = several.filter((p) => p.method === method);
-        line(points.map((p) => ({ ...p, shift: p.left - sx.at(p.x) })), colour, again ? { "stroke-dasharray": "2 3" } : {});
+        const dots = again ? { "stroke-dasharray": "2 3" } : {};
+        line(points.map((p) => ({ ...p, shift: p.left - sx.at(p.x) })), colour, dots);
       });
       if (up === "e2" && "bound" in place) {
         const bounds = several.map((p) => ({ x: p.x, y: number(rows[p.row][place.bound]), shift: 0 }));
         line(bounds.filter((p) => p.y > 0), this.about.ink, { "stroke-dasharray": "6 4", class: "bound" });
-        if (bounds.some((p) => p.y > 0)) parts.push(draw("text", { x: frame.right, y: frame.bottom - 6, "text-anchor": "end" }, "dashed: Cram\u00e9r-Rao bound"));
+        const corner = { x: frame.right, y: frame.bottom - 6, "text-anchor": "end" };
+        if (bounds.some((p) => p.y > 0)) parts.push(draw("text", corner, "dashed: Cram\u00e9r-Rao bound"));
       }
       return parts;
     }
@@ -277,9 +285,10 @@
     spread(p, sy, held, rim) {
       const cells = this.shown.data.rows[p.row], { place } = this.shown;
       if (!("e2_low" in place) || cells[place.e2_low] === "") return [];
-      const ends = ["e2_low", "e2_high"].map((name) => number(cells[place[name]])).map((y) => (Number.isFinite(y) ? sy.at(held(y)) : rim));
-      const colour = this.about.methods[this.methods.indexOf(p.method)][1];
-      return [draw("path", { d: `M${p.left} ${ends[0]}V${ends[1]}`, stroke: colour, "stroke-width": 1.2, opacity: 0.6 })];
+      const at = (y) => (Number.isFinite(y) ? sy.at(held(y)) : rim);
+      const [low, high] = ["e2_low", "e2_high"].map((name) => at(number(cells[place[name]])));
+      const stroke = this.about.methods[this.methods.indexOf(p.method)][1];
+      return [draw("path", { d: `M${p.left} ${low}V${high}`, stroke, "stroke-width": 1.2, opacity: 0.6 })];
     }
 
     nearest(event) {
@@ -292,8 +301,9 @@
       const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
       if (!this.points.length || !(step || event.key === "Enter")) return;
       event.preventDefault();
+      const first = this.ring.getAttribute("visibility") === "hidden";
       if (!step) this.shown.explain(this.points[this.at].row);
-      else this.go(this.ring.getAttribute("visibility") === "hidden" ? 0 : Math.min(Math.max(this.at + step, 0), this.points.length - 1));
+      else this.go(first ? 0 : Math.min(Math.max(this.at + step, 0), this.points.length - 1));
     }
 
     go(k) {
@@ -303,7 +313,8 @@
       fill(this.ring, { cx: p.left, cy: p.top, visibility: "visible" }, []);
       const told = ["part", "system", "data", "library"].map((name) => cells[place[name]]).filter(Boolean).join(" ");
       const pair = (name) => `${this.shown.data.columns[place[name]][1]} ${brief(number(cells[place[name]]))}`;
-      this.told.textContent = `${p.method}: ${told}, ${[...new Set(["noise", this.x.select.value, this.y.select.value])].map(pair).join(", ")}`;
+      const numbers = new Set(["noise", this.x.select.value, this.y.select.value]);
+      this.told.textContent = `${p.method}: ${told}, ${[...numbers].map(pair).join(", ")}`;
     }
   }
 
@@ -312,22 +323,27 @@
   function scale(values, log, a, b, zero, own) {
     const used = log ? values.filter((value) => value > 0) : values;
     const start = zero ? a + Math.sign(b - a) * 44 : a, sign = Math.sign(b - start);
-    if (!used.length) return { at: () => (zero ? a + sign * 20 : (a + b) / 2), ticks: zero ? [0] : [] };
+    if (!used.length) return { at: () => (zero ? a + 20 * sign : (a + b) / 2), ticks: zero ? [0] : [] };
     const form = log ? Math.log10 : (value) => value;
     let low = Math.min(...used.map(form)), high = Math.max(...used.map(form));
     if (log) { low = Math.floor(low + 1e-9); high = Math.max(Math.ceil(high - 1e-9), low + 1); }
     else { low = Math.min(low, 0); high = high > low ? high : low + 1; }
-    const room = 12, at = (value) => (log && value <= 0 ? a + sign * 20 : start + sign * room + ((form(value) - low) / (high - low)) * (b - start - 2 * sign * room));
-    const step = Math.max(1, Math.ceil((high - low) / 7));
-    const ticks = own ? [...new Set(used)].sort((c, d) => c - d).filter((value, k, all) => !k || Math.abs(at(value) - at(all[k - 1])) > 26)
-      : log ? Array.from({ length: Math.floor((high - low) / step) + 1 }, (_, k) => Number(`1e${low + k * step}`))
-      : [0, 0.25, 0.5, 0.75, 1].map((share) => low + share * (high - low));
+    const from = start + 12 * sign, to = b - 12 * sign;
+    const share = (value) => (form(value) - low) / (high - low);
+    const at = (value) => (log && value <= 0 ? a + 20 * sign : from + share(value) * (to - from));
+    const step = Math.max(1, Math.ceil((high - low) / 7)), apart = 26;
+    const far = (value, k, all) => !k || Math.abs(at(value) - at(all[k - 1])) > apart;
+    const many = Math.floor((high - low) / step) + 1;
+    const decades = () => Array.from({ length: many }, (_, k) => Number(`1e${low + k * step}`));
+    const quarters = () => [0, 0.25, 0.5, 0.75, 1].map((part) => low + part * (high - low));
+    const ticks = own ? [...new Set(used)].sort((c, d) => c - d).filter(far) : log ? decades() : quarters();
     return { at, ticks: zero ? [0, ...ticks] : ticks };
   }
 
   function* axes(sx, sy, frame, across, up) {
     const line = (d) => draw("path", { d, stroke: "#c9ced4", fill: "none" });
-    const shown = (value) => (value === 0 ? "0" : Math.abs(value) >= 1e-3 && Math.abs(value) < 1e5 ? brief(value) : value.toExponential(0));
+    const plain = (value) => value === 0 || (Math.abs(value) >= 1e-3 && Math.abs(value) < 1e5);
+    const shown = (value) => (plain(value) ? brief(value) : value.toExponential(0));
     for (const value of sy.ticks) {
       yield line(`M${frame.left} ${sy.at(value)}H${frame.right}`);
       yield draw("text", { x: frame.left - 6, y: sy.at(value) + 4, "text-anchor": "end" }, shown(value));
@@ -338,7 +354,8 @@
     }
     yield line(`M${frame.left} ${frame.top}V${frame.bottom}H${frame.right}`);
     yield draw("text", { x: (frame.left + frame.right) / 2, y: frame.bottom + 37, "text-anchor": "middle" }, across);
-    yield draw("text", { transform: `translate(13 ${(frame.top + frame.bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, up);
+    const turned = `translate(13 ${(frame.top + frame.bottom) / 2}) rotate(-90)`;
+    yield draw("text", { transform: turned, "text-anchor": "middle" }, up);
   }
 
   for (const box of document.querySelectorAll(".shown")) new Shown(box);
