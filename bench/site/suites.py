@@ -76,7 +76,8 @@ def of_fits(folder: Folder) -> View | None:
     shown = Table(tuple(kept), tuple(tuple(row.get(name, "") for name in kept) for row in rows), table.about)
     figure = _figure(shown)
     note = "" if spread else "The single cases of this suite are not published, so no spread is known."
-    return View(shown, tuple(name for name in FILTERS if name in kept), figure, tuple(details), note)
+    filters = tuple(name for name in FILTERS if name in kept and len(set(shown.column(name))) > 1)
+    return View(shown, filters, figure, tuple(details), note)
 
 
 def _key(row: Mapping[str, str]) -> tuple[str, ...]:

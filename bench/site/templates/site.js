@@ -277,7 +277,7 @@
         const bounds = several.map((p) => ({ x: p.x, y: number(rows[p.row][place.bound]), shift: 0 }));
         line(bounds.filter((p) => p.y > 0), this.about.ink, { "stroke-dasharray": "6 4", class: "bound" });
         const corner = { x: frame.right, y: frame.bottom - 6, "text-anchor": "end" };
-        if (bounds.some((p) => p.y > 0)) parts.push(draw("text", corner, "dashed: Cram\u00e9r-Rao bound"));
+        if (bounds.some((p) => p.y > 0)) parts.push(draw("text", corner, "dashed: Cram\u00e9r-Rao bound, all terms kept"));
       }
       return parts;
     }
@@ -331,7 +331,7 @@
     const from = start + 12 * sign, to = b - 12 * sign;
     const share = (value) => (form(value) - low) / (high - low);
     const at = (value) => (log && value <= 0 ? a + 20 * sign : from + share(value) * (to - from));
-    const step = Math.max(1, Math.ceil((high - low) / 7)), apart = 26;
+    const step = Math.max(1, Math.ceil(((high - low) * 44) / Math.abs(to - from))), apart = 26;
     const far = (value, k, all) => !k || Math.abs(at(value) - at(all[k - 1])) > apart;
     const many = Math.floor((high - low) / step) + 1;
     const decades = () => Array.from({ length: many }, (_, k) => Number(`1e${low + k * step}`));
