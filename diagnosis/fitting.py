@@ -305,7 +305,7 @@ def fit(
         splines: of the curves of the sites without an equation, to start from.
         hope: a cost; the fit is given up where the next step promises less than half of the way there.
     """
-    path = follow(model, layout, near, splines=splines)
+    path = follow(model, layout, near, splines=splines) if model.possible else None
     followed = None if path is None else linearised(path, layout)
     if followed is None:
         return None
@@ -405,7 +405,7 @@ def _stepped(
             varied = np.concatenate([local, np.broadcast_to(change, (len(local), len(change)))], axis=1)
             near.append(y + (varied[:, None, None] @ moves)[:, :, 0])
         model = followed.model.moved(followed.model.numbers + change)
-        trial = follow(model, layout, near, followed.transitions, splines)
+        trial = follow(model, layout, near, followed.transitions, splines) if model.possible else None
         if trial is not None:
             won = before + noise.log_likelihood(trial.left, trial.swing, rows)
             further = linearised(trial, layout) if won > -1e-6 else None

@@ -13,6 +13,7 @@ import numpy as np
 from latticebench.diagnosis.fitting import Fitted, fit
 from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.past import past_of
 from latticebench.diagnosis.problem import Problem
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.systems.samples import Samples
@@ -82,6 +83,7 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
     near = [nodes[rows] for nodes, rows in zip(early.nodes, layout.rows, strict=True)]
     if not held_out:
         near = _from(fitted, layout, early)
+    model = model.with_past(past_of(early, layout, model, near))
     layout = layout.with_substeps(model, near, other.top)
     again, noise, most = None, fitted.noise, max(steps, STEPS)
     # A model may be followed by all readings and run away by the early ones.
@@ -124,7 +126,7 @@ def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Predi
     cut = int(np.max(rows)) + 1
     late = record.times[cut : cut + MOST_ROWS]
     past = _Past(record.times[rows[-1]], nodes[-1], problem)
-    model = replace(model, effects=tuple(one.with_past(past) for one in model.effects))
+    model = model.with_past((past,))
     assembled = model.assembled(problem.plain, problem.chain, number)
     state, found = nodes[-1, -1], []
     times = np.concatenate([[record.times[cut - 1]], late])

@@ -36,6 +36,8 @@ FALLING = 0.85
 LINE = 30.0
 # Cycles per reading from which on differences take little from a signal.
 FAST = 0.2
+# Bands of the spectrum, of which one may hold nothing but noise, and the fewest frequencies in each.
+BANDS, FEWEST_LINES = 16, 8
 ROBUST = 1.4826  # standard deviation over median absolute value, of a Gaussian
 
 
@@ -156,6 +158,27 @@ def of_readings(t: Float[ndarray, " time"], u: Shaped[ndarray, "time sites"]) ->
         if np.count_nonzero(kept) > 4:
             found[site] = _size(t[kept], u[kept, site])
     return found
+
+
+def quietest(t: Float[ndarray, " time"], u: Float[ndarray, "time parts sites"]) -> Float[ndarray, " sites"]:
+    """Return the size of white noise whose spectrum is that of the readings where it is least; NaN where that is open.
+
+    Of noise that has not all frequencies alike it is a lower estimate. Missing and uneven readings are interpolated.
+    """
+    step = float(np.median(np.diff(t)))
+    grid = np.arange(t[0], t[-1] + step / 2, step)
+    if len(grid) < 2 * BANDS * FEWEST_LINES:
+        return np.full(u.shape[2], np.nan)
+    window = np.hanning(len(grid))
+    found = np.full(u.shape[1:], np.nan)
+    for part, site in np.ndindex(*found.shape):
+        seen = np.isfinite(u[:, part, site])
+        if np.sum(seen) < len(grid) / 2:
+            continue
+        even = np.interp(grid, t[seen], u[seen, part, site])
+        power = np.abs(np.fft.rfft((even - np.mean(even)) * window)[1:-1]) ** 2 / np.sum(window**2)
+        found[part, site] = np.sqrt(min(np.median(band) for band in np.array_split(power, BANDS)) / np.log(2))
+    return np.asarray(np.sqrt(np.mean(found**2, axis=0)))
 
 
 def _size(t: Float[ndarray, " time"], values: Float[ndarray, " time"]) -> float:

@@ -73,6 +73,15 @@ class Model:
         """What distinguishes models, their numbers apart."""
         return tuple(sorted(repr((one.near, one.turns)) for one in self.effects))
 
+    @property
+    def possible(self) -> bool:
+        """Whether all effects have numbers such as they may have."""
+        return all(one.possible for one in self.effects)
+
+    def with_past(self, past: tuple[Factor, ...]) -> Model:
+        """Return the same model, fed with another field at earlier times of each recording."""
+        return replace(self, effects=tuple(one.with_past(past) for one in self.effects))
+
     def moved(self, numbers: Float[ndarray, " numbers"]) -> Model:
         """Return the same model with other numbers."""
         count = len(self.coefficients)

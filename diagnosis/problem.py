@@ -12,7 +12,7 @@ import numpy as np
 
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain, Placed, Scene, way_of
-from latticebench.diagnosis.instrument import of_readings, step_of
+from latticebench.diagnosis.instrument import of_readings, quietest, step_of
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.engine.derivatives import DEGREE, differentiate
 from latticebench.methods.engine.dynamics import Dynamics, Factor, split_parts
@@ -146,7 +146,9 @@ class Problem:
         chain = Chain(first.sites, order, first.is_complex, levels, first.ends, moving, widest)
         step = float(np.median(np.diff(longest.t)))
         span = float(longest.t[-1] - longest.t[0])
-        past = tuple(_past(one, field[0], first.is_complex) for one, field in zip(data, states, strict=True))
+        past = tuple(
+            course(one.t, split_parts(field[0], first.is_complex)) for one, field in zip(data, states, strict=True)
+        )
         scene = Scene(
             chain,
             float(first.t[0]),
@@ -200,7 +202,14 @@ class Problem:
         for field in self._fields(longest):
             parts = [of_readings(longest.t, part) for part in [field.real, field.imag][: self.chain.parts]]
             found.append(np.sqrt(np.mean(np.stack(parts) ** 2, axis=0)))
-        return np.concatenate(found)
+        noise = np.concatenate(found)
+        if longest.f is None or np.all(np.isfinite(noise)):
+            return noise
+        # An input moves the sites as fast as readings may follow one another; some frequencies it leaves alone.
+        own = np.concatenate(
+            [quietest(longest.t, split_parts(one, self.chain.is_complex)) for one in self._fields(longest)]
+        )
+        return np.where(np.isfinite(noise), noise, own)
 
     @functools.cached_property
     def steps(self) -> tuple[float, ...]:
@@ -339,11 +348,12 @@ def _record(samples: Samples, plain: Dynamics, states: tuple[ndarray, ndarray | 
     return Record(stretches, np.where(np.isfinite(value), value, 0.0), seen, samples.t), splines
 
 
-def _past(samples: Samples, u: ndarray, is_complex: bool) -> Factor:
+def course(t: Float[ndarray, " time"], field: Float[ndarray, "time parts sites"]) -> Factor:
+    """Return the field as a function of times, (B,) -> (parts, B, N), constant before and after the recording."""
     from scipy.interpolate import CubicSpline
 
-    curve = CubicSpline(samples.t, split_parts(u, is_complex))
-    begin, end = float(samples.t[0]), float(samples.t[-1])
+    curve = CubicSpline(t, field)
+    begin, end = float(t[0]), float(t[-1])
 
     def past(t: ndarray) -> ndarray:
         return np.moveaxis(np.asarray(curve(np.clip(t, begin, end))), 0, 1)

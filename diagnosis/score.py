@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from latticebench.diagnosis.acting import Force, Placed
 from latticebench.diagnosis.fitting import Fitted, by_pieces, gain, normal, scaled_inverse, whitened
@@ -34,6 +35,8 @@ CHUNK = 8_000_000
 DIRECTIONS, ALIKE, LIKELIEST = 24, 1e-3, 12
 # Seed of the directions: the same each time, so that a diagnosis is.
 SIGNS = 0
+# Candidates beside one whose median is known to a third.
+FEW_BESIDE = 8
 # Directions that the model can do already, as a share of what a candidate does.
 OLD = 1e-4
 
@@ -198,6 +201,18 @@ class Tangent:
         for _, one in ranked:
             kept.setdefault(kind(one), []).append(one)
         return [one for few in kept.values() for one in few[:LIKELIEST]]
+
+    def crowding(self, placed: Placed, candidates: Sequence[Placed]) -> float:
+        """Return how many times as many nats as noise lets them those beside a candidate win, at least 1.
+
+        A line is one where it stands out from its surroundings. What an equation misfits has a spectrum of its own, in
+        which every frequency wins something.
+        """
+        others = placed.beside(candidates)
+        if len(others) < FEW_BESIDE:
+            return 1.0
+        usual = float(np.median(self._glanced(others)))
+        return max(1.0, usual / gammaincinv(len(placed.strength) / 2, 0.5))
 
     def _glanced(self, candidates: Sequence[Placed]) -> list[float]:
         """Return about how many nats forces would win, without what each of them would do to the readings.

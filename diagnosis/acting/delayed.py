@@ -27,13 +27,14 @@ class Delayed(Placed, acts="delayed"):
 
     Attributes:
         delay: in the unit of time.
-        past: the smoothed field of each recording.
+        past: the field of each recording at earlier times.
     """
 
     delay: float
     past: tuple[Factor, ...]
     shape: ClassVar[tuple[str, ...]] = ("delay",)
     timed: ClassVar[bool] = True
+    fed: ClassVar[bool] = True
     separated_by: ClassVar[str] = "a motion of other frequencies: a lag turns into another phase at each of them"
 
     @classmethod
@@ -47,9 +48,14 @@ class Delayed(Placed, acts="delayed"):
         label = f"u[n](t-{self.delay:.6g})"
         return (label, f"i*{label}")[: chain.parts]
 
-    def with_past(self, past: Factor) -> Self:
+    @property
+    def possible(self) -> bool:
+        """Whether the past comes before the present."""
+        return self.delay > 0
+
+    def with_past(self, past: tuple[Factor, ...]) -> Self:
         """Return it with another field at earlier times."""
-        return replace(self, past=(past,))
+        return replace(self, past=past)
 
     def forces(self, chain: Chain) -> list[Force]:
         """Return the field as it was and, for the delay, its derivative."""

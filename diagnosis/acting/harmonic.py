@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import bisect
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -15,6 +16,9 @@ from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     from numpy import ndarray
+
+# Frequencies of the scene, half a resolution apart, that belong to a line, and those that are beside it.
+LINE, FAR = 4, 24
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,6 +60,13 @@ class Harmonic(Placed, acts="harmonic"):
     def frequency(self) -> float:
         """The angular frequency."""
         return self.omega
+
+    def beside(self, others: Sequence[Placed]) -> list[Placed]:
+        """Return the waves at the next frequencies to both sides, without those in the line that this one makes."""
+        alike = [one for one in others if isinstance(one, Harmonic) and one.place == self.place]
+        alike.sort(key=lambda one: one.omega)
+        here = bisect.bisect(alike, self.omega, key=lambda one: one.omega)
+        return [*alike[max(here - FAR, 0) : max(here - LINE, 0)], *alike[here + LINE : here + FAR]]
 
     def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return the waves and, for the frequency, their derivatives by it."""

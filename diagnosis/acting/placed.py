@@ -164,6 +164,7 @@ class Placed(ABC):
         instrument: whether it acts on readings, not on the motion.
         timed: whether it has a frequency or a time of its own; it can then stand in for much on short horizons.
         local: whether it acts at single sites, or at each differently.
+        fed: whether it depends on the field at earlier times.
         separated_by: the measurement that tells this way of acting from others; nothing where none is known.
     """
 
@@ -173,6 +174,7 @@ class Placed(ABC):
     instrument: ClassVar[bool] = False
     timed: ClassVar[bool] = False
     local: ClassVar[bool] = False
+    fed: ClassVar[bool] = False
     separated_by: ClassVar[str] = ""
 
     def __init_subclass__(cls, acts: str = "", how: str = "") -> None:
@@ -222,12 +224,21 @@ class Placed(ABC):
         """The angular frequency at which it swings; None where it has none of its own."""
         return None
 
+    def beside(self, others: Sequence[Placed]) -> list[Placed]:  # noqa: ARG002
+        """Return those of its kind that act nearly, but plainly not as it does; none where no such order is known."""
+        return []
+
     def begun(self, t: float) -> bool:  # noqa: ARG002
         """Return whether readings before a time show it."""
         return True
 
-    def with_past(self, past: Factor) -> Self:  # noqa: ARG002
-        """Return it with another field at earlier times, (B,) -> (parts, B, N), where it depends on that."""
+    @property
+    def possible(self) -> bool:
+        """Whether its numbers are such as it may have."""
+        return True
+
+    def with_past(self, past: tuple[Factor, ...]) -> Self:  # noqa: ARG002
+        """Return it with another field at earlier times, (B,) -> (parts, B, N) of each recording, where it is fed."""
         return self
 
     def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002

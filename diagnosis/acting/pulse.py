@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # Middles that are tried of each width, at most, and the ratio of one width to the next.
 MOST_MIDDLES, WIDER = 60, 3.0
+# Widths between pulses that hardly overlap, and those beside a pulse that it is compared with.
+APART, BESIDE = 4.0, 24
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,6 +59,14 @@ class Pulse(Placed, acts="pulse"):
     def near(self) -> tuple[object, ...]:
         """The effect and its middle, to a width."""
         return (self.effect.name, f"{self.at / max(abs(self.width), 1e-300):.0f}")
+
+    def beside(self, others: Sequence[Placed]) -> list[Placed]:
+        """Return the next pulses of its width, before and after, that hardly overlap with it."""
+        own = max(abs(self.width), 1e-300)
+        alike = [one for one in others if isinstance(one, Pulse) and one.place == self.place]
+        width = min((one.width for one in alike), key=lambda one: abs(np.log(one / own)), default=own)
+        apart = [one for one in alike if one.width == width and abs(one.at - self.at) > APART * max(own, width)]
+        return sorted(apart, key=lambda one: abs(one.at - self.at))[:BESIDE]
 
     def begun(self, t: float) -> bool:
         """Return whether its middle is before a time: later, its strength is not known."""
