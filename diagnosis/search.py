@@ -16,10 +16,11 @@ import numpy as np
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.border import MOST
-from latticebench.diagnosis.fitting import Fitted, fit
+from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.horizon import Layout, unread
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure, estimate
+from latticebench.diagnosis.past import past_of, settled
 from latticebench.diagnosis.problem import Problem, regressed, turned
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.worth import COUPLING, Worth, beyond, misfits, over, repelling, same, wald
@@ -300,9 +301,10 @@ class Search:
         splines = start.followed.splines if start is not None and known else None
         with np.errstate(all="ignore"):
             try:
-                return fit(
-                    model, layout, near, structure=self.structure, noise=noise, steps=steps, hope=hope, splines=splines
-                )
+                return settled(
+                    self.problem, model, layout, near,
+                    structure=self.structure, noise=noise, steps=steps, hope=hope, splines=splines,
+                )  # fmt: skip
             except np.linalg.LinAlgError:
                 return None
 
@@ -473,7 +475,8 @@ class Search:
         absent = [one for one in self.open if one.place not in present and not one.timed]
         tangent, own = self.tangent(fitted), Worth(self.problem, fitted)
         if timed:
-            courses = [one for one in self.open if one.timed]
+            past = past_of(self.problem, fitted.layout, fitted.model, fitted.followed.nodes)
+            courses = [one.with_past(past) for one in self.open if one.timed]
             absent += tangent.likeliest(courses, self.problem.price_of, lambda one: one.effect.name)
         best: dict[tuple[object, ...], tuple[float, Scored]] = {}
         tried: dict[str, Tried] = {}
@@ -482,6 +485,8 @@ class Search:
             price = self.problem.price(name, one.freedom) + self.problem.locked(one.placed)
             if name not in tried or one.gain - price > tried[name].gain - tried[name].price:
                 tried[name] = Tried(name, one.gain, price)
+            if one.placed.frequency is not None:
+                price *= max(1.0, tangent.crowding(one.placed, self.open) / fitted.dispersion)
             key = one.placed.place
             least = max(price, own.price_of(one.placed) * fitted.dispersion / rules.UNDERSTATED)
             if one.freedom and one.gain > least and (key not in best or one.gain - price > best[key][0]):

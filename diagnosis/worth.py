@@ -13,6 +13,7 @@ from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.problem import Problem
+from latticebench.diagnosis.score import Tangent
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -84,6 +85,15 @@ def same(one: Fitted, other: Fitted) -> bool:
     return float(np.sqrt(np.nanmean(((levels[0] - levels[1]) / size) ** 2))) < SAME_READING
 
 
+@functools.lru_cache(maxsize=64)
+def crowding(problem: Problem, fitted: Fitted) -> tuple[float, ...]:
+    """Return for each effect how many times as many nats as noise lets them others beside it still win."""
+    if not any(one.timed for one in fitted.model.effects):
+        return (1.0,) * len(fitted.model.effects)
+    tangent = Tangent(fitted)
+    return tuple(tangent.crowding(one, problem.candidates) for one in fitted.model.effects)
+
+
 @dataclass(frozen=True, eq=False)
 class Worth:
     """What models are worth beside the best of them, whose misfit says how much evidence counts.
@@ -111,7 +121,10 @@ class Worth:
     def price(self, fitted: Fitted) -> float:
         """Return the price of a model: of its effects and of the noise's parameters."""
         noise = fitted.noise.parameters / 2 * np.log(max(fitted.layout.readings(), 2))
-        return sum(map(self.price_of, fitted.model.effects)) + float(noise) + repelling(self.problem, fitted.model)
+        effects = zip(fitted.model.effects, crowding(self.problem, fitted), strict=True)
+        misfit = 1.0 if self.best is None else self.best.dispersion
+        prices = sum(self.price_of(one) * max(1.0, many / misfit) for one, many in effects)
+        return prices + float(noise) + repelling(self.problem, fitted.model)
 
     def value(self, fitted: Fitted) -> float:
         """Return the cost of a fit, as much less as the best one misfits, and its price, in nats."""
