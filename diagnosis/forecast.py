@@ -69,7 +69,7 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
         held_out: other recordings.
     """
     if held_out:
-        other = Problem.of(problem.declared, problem.order, held_out, ())
+        other = Problem.of(problem.declared, problem.order, held_out, ()).interpolated(problem.degree)
         share, steps = HELD_OUT, 0
         model = fitted.model
     else:

@@ -1,8 +1,8 @@
 """What feeds a motion with its own past: the field at earlier times is the model's own, not what was read.
 
-A term that is fed with readings guides the motion to them, whatever the equation lacks, as an observer does (Luenberger,
-IEEE Trans. Autom. Control 16, 596 (1971)). The past of a fit is therefore the motion that an earlier fit has found, until
-both are the same.
+A term that is fed with readings guides the motion to them, whatever the equation lacks, as an observer does
+(Luenberger, IEEE Trans. Autom. Control 16, 596 (1971)). The past of a fit is therefore the motion that an earlier fit
+has found, until both are the same.
 """
 
 from __future__ import annotations

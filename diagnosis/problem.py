@@ -32,6 +32,11 @@ if TYPE_CHECKING:
 WIDE, LONG_CHAIN = 2, 9
 # A dense recording is thinned to so many samples in the shortest period, a long one cut to windows of so many samples.
 DENSE, LONG, WINDOWS = 24, 4000, 2
+# Samples of an input before and after a part of a recording: a spline forgets what is so far away.
+MARGIN = 40
+# Degrees of the splines that an input may follow between its samples: held, as a converter does, in straight lines, or
+# smoothly. At three samples a period, a tenth of a wave is lost by the cubic spline, a hundredth by the last.
+DEGREES = (0, 1, 3, 7)
 # A peak of the spectrum is motion where it stands so many times above the noise, and has this share of the largest.
 ABOVE, SHARE = 30.0, 3e-3
 # Outside influences are looked for up to so many times the highest frequency, at so many frequencies at most.
@@ -99,6 +104,8 @@ class Problem:
         splines: of the sites without an equation, of each recording; None where every site has one.
         spectrum: of the longest recording.
         step: typical time between readings.
+        forced: the inputs of each recording at their own times; None where nothing was measured.
+        degree: of the splines between them, of `DEGREES`.
         scene: where effects are placed.
         candidates: all effects in all places.
     """
@@ -115,6 +122,8 @@ class Problem:
     step: float
     scene: Scene
     candidates: tuple[Placed, ...]
+    forced: tuple[Samples | None, ...] = ()
+    degree: int = 3
 
     @classmethod
     def of(cls, declared: Library, order: int, data: Sequence[Samples], catalogue: Sequence[Effect]) -> Problem:
@@ -127,7 +136,8 @@ class Problem:
         longest = max(data, key=lambda one: len(one.t))
         spectrum = Spectrum.of(longest)
         top = _top(spectrum, longest)
-        data = tuple(part for one in data for part in windows(thinned(one, top)))
+        parts = [(part, one) for one in data for part in windows(thinned(one, top))]
+        data, forced = tuple(part for part, _ in parts), tuple(around(*pair) for pair in parts)
         longest = max(data, key=lambda one: len(one.t))
         first = data[0]
         reach = (WIDE, WIDE) if first.ends == "unknown" and first.sites >= LONG_CHAIN else (0, 0)
@@ -137,9 +147,7 @@ class Problem:
             far = max(plain.reach)
             plain = replace(plain, least_reach=(far, far) if first.sites > 2 * far else plain.reach)
         states = [_states(one, order) for one in data]
-        records, splines = zip(
-            *(_record(one, plain, both) for one, both in zip(data, states, strict=True)), strict=True
-        )
+        records, splines = zip(*(_record(*each, plain) for each in zip(data, forced, states, strict=True)), strict=True)
         widest = min(plain.reach) if first.ends == "unknown" else first.sites - 1
         levels = records[0].value.shape[1]
         moving = tuple(range(first.sites)[plain.moving])
@@ -162,8 +170,17 @@ class Problem:
         candidates = tuple(one for effect in catalogue for one in way_of(effect).places(effect, scene))
         nodes = tuple(plain.pack(*both) for both in states)
         return cls(
-            declared, order, data, chain, plain, records, nodes, splines, spectrum, step, scene, candidates
+            declared, order, data, chain, plain, records, nodes, splines, spectrum, step, scene, candidates,
+            forced,
         )  # fmt: skip
+
+    def interpolated(self, degree: int) -> Problem:
+        """Return the same problem with inputs that follow splines of another degree between their samples."""
+        records = tuple(
+            replace(record, stretches=replace(record.stretches, inputs=None if one is None else one.forcing(degree)))
+            for record, one in zip(self.records, self.forced, strict=True)
+        )
+        return replace(self, records=records, degree=degree)
 
     def first(self, share: float) -> Problem:
         """Return the problem of the first share of each recording."""
@@ -291,13 +308,29 @@ def _check_gaps(data: Sequence[Samples]) -> None:
 
 
 def thinned(samples: Samples, top: float) -> Samples:
-    """Return every k-th sample of one that is read far more often than it moves, and at least `LONG` / 2 of them."""
+    """Return every k-th sample of one that is read far more often than it moves, and at least `LONG` / 2 of them.
+
+    Beside an input k is a power of two, so that steps of an integrator, which are halved, end where its samples are.
+    """
     step = float(np.median(np.diff(samples.t)))
     stride = min(int(2 * np.pi / top / step / DENSE), len(samples.t) // (LONG // 2))
-    if stride < 2 or samples.f is not None:
+    if stride < 2:
         return samples
+    if samples.f is not None:
+        stride = 1 << (stride.bit_length() - 1)
+    f = None if samples.f is None else samples.f[::stride]
     u, v = samples.u[::stride], None if samples.v is None else samples.v[::stride]
-    return replace(samples, t=samples.t[::stride], u=u, v=v)
+    return replace(samples, t=samples.t[::stride], u=u, v=v, f=f)
+
+
+def around(part: Samples, whole: Samples) -> Samples | None:
+    """Return the samples of a recording's input from a little before to a little after a part of it."""
+    if whole.f is None:
+        return None
+    begin, end = np.searchsorted(whole.t, part.t[[0, -1]])
+    rows = slice(max(begin - MARGIN, 0), end + 1 + MARGIN)
+    v = None if whole.v is None else whole.v[rows]
+    return replace(whole, t=whole.t[rows], u=np.zeros_like(whole.u[rows]), v=v, f=whole.f[rows])
 
 
 def windows(samples: Samples) -> list[Samples]:
@@ -332,7 +365,9 @@ def _states(samples: Samples, order: int) -> tuple[ndarray, ndarray | None]:
     return smooth(samples, order)
 
 
-def _record(samples: Samples, plain: Dynamics, states: tuple[ndarray, ndarray | None]) -> tuple[Record, ndarray | None]:
+def _record(
+    samples: Samples, forced: Samples | None, states: tuple[ndarray, ndarray | None], plain: Dynamics
+) -> tuple[Record, ndarray | None]:
     """Return the readings, and the splines of the sites that have no equation."""
     fields = [samples.u] if plain.order == 1 or samples.v is None else [samples.u, samples.v]
     value = np.stack([split_parts(one, samples.is_complex) for one in fields], axis=1)
@@ -343,7 +378,7 @@ def _record(samples: Samples, plain: Dynamics, states: tuple[ndarray, ndarray | 
 
         curve = make_interp_spline(samples.t, split_parts(states[0][:, plain.border], samples.is_complex), k=3)
         drive, splines = BSplines(curve.t, 3), curve.c
-    inputs = None if samples.f is None else samples.forcing()
+    inputs = None if forced is None else forced.forcing()
     stretches = Stretches(plain, samples.t[:-1], samples.t[1:], inputs, drive, held=True)
     return Record(stretches, np.where(np.isfinite(value), value, 0.0), seen, samples.t), splines
 

@@ -212,7 +212,7 @@ class Tangent:
         if len(others) < FEW_BESIDE:
             return 1.0
         usual = float(np.median(self._glanced(others)))
-        return max(1.0, usual / gammaincinv(len(placed.strength) / 2, 0.5))
+        return max(1.0, usual / float(gammaincinv(len(placed.strength) / 2, 0.5)))
 
     def _glanced(self, candidates: Sequence[Placed]) -> list[float]:
         """Return about how many nats forces would win, without what each of them would do to the readings.

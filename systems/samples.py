@@ -149,10 +149,11 @@ class Samples:
         """Whether any value is NaN."""
         return any(bool(np.any(np.isnan(array))) for array in (self.u, self.v, self.f) if array is not None)
 
-    def forcing(self) -> Callable[[ndarray], ndarray]:
+    def forcing(self, degree: int = 3) -> Callable[[ndarray], ndarray]:
         """Return the measured input as a function of times (B,), with values (B, N).
 
-        At each site it is the cubic spline through the samples, after gaps have been bridged by straight lines.
+        At each site it is a spline through the samples, after gaps have been bridged by straight lines: cubic, or of
+        another odd degree, or of degree 0, which holds each value until the next one.
 
         Raises:
             InputError: no input was measured, or all its values at a site are missing.
@@ -167,7 +168,9 @@ class Samples:
             if not np.any(seen):
                 raise InputError(f"{self.source}: the measured input of site {site + 1} is missing throughout")
             f[~seen, site] = np.interp(self.t[~seen], self.t[seen], f[seen, site])
-        curve: Callable[[ndarray], ndarray] = make_interp_spline(self.t, f, k=min(3, len(self.t) - 1))
+        curve: Callable[[ndarray], ndarray] = make_interp_spline(
+            self.t, f, k=min(degree, (len(self.t) - 2) // 2 * 2 + 1)
+        )
         return curve
 
     def mirrored(self) -> Samples:

@@ -61,7 +61,7 @@ class Harmonic(Placed, acts="harmonic"):
         """The angular frequency."""
         return self.omega
 
-    def beside(self, others: Sequence[Placed]) -> list[Placed]:
+    def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:
         """Return the waves at the next frequencies to both sides, without those in the line that this one makes."""
         alike = [one for one in others if isinstance(one, Harmonic) and one.place == self.place]
         alike.sort(key=lambda one: one.omega)

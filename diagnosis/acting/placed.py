@@ -224,9 +224,9 @@ class Placed(ABC):
         """The angular frequency at which it swings; None where it has none of its own."""
         return None
 
-    def beside(self, others: Sequence[Placed]) -> list[Placed]:  # noqa: ARG002
+    def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:  # noqa: ARG002
         """Return those of its kind that act nearly, but plainly not as it does; none where no such order is known."""
-        return []
+        return ()
 
     def begun(self, t: float) -> bool:  # noqa: ARG002
         """Return whether readings before a time show it."""

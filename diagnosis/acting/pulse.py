@@ -60,7 +60,7 @@ class Pulse(Placed, acts="pulse"):
         """The effect and its middle, to a width."""
         return (self.effect.name, f"{self.at / max(abs(self.width), 1e-300):.0f}")
 
-    def beside(self, others: Sequence[Placed]) -> list[Placed]:
+    def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:
         """Return the next pulses of its width, before and after, that hardly overlap with it."""
         own = max(abs(self.width), 1e-300)
         alike = [one for one in others if isinstance(one, Pulse) and one.place == self.place]

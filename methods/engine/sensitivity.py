@@ -36,6 +36,8 @@ Input = Callable[["ndarray"], "ndarray"]
 # Numbers of one stage that are worked on at a time: fewer cost calls, more leave the processor's cache.
 CHUNK = 200_000
 MAX_SUBSTEPS = 256
+# Inputs are evaluated in this part of a step.
+INSIDE = 1 - 1e-9
 # The largest share of a disturbance that may be left beyond its reach.
 TAIL = 1e-9
 # Where terms read more places than this of each part, all sites are taken to couple: one product of matrices is faster.
@@ -288,7 +290,9 @@ class Stretches:
                     at_y = y + h[:, None] * _combine(a[stage, :stage], slopes_y)
                     if z is not None:
                         at_z = z + h * _combine(a[stage, :stage], slopes_z)
-                f = None if self.inputs is None else self.inputs(t)
+                # An input that is held jumps from one step to the next: each sees its own side.
+                inside = begin + (step + 0.5 + INSIDE * (c[stage] - 0.5)) * h
+                f = None if self.inputs is None else self.inputs(inside)
                 driven = self.driven(t, splines)
                 rate, values, slopes = self.dynamics.linear(
                     coefficients, t, at_y, f, driven, derivatives=z is not None, step=h
