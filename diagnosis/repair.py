@@ -15,6 +15,7 @@ from latticebench.diagnosis.finding import Compared, Finding, compared, findings
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.forecast import Prediction, pooled, predict
 from latticebench.diagnosis.horizon import unread
+from latticebench.diagnosis.inputs import in_words
 from latticebench.diagnosis.instrument import describe
 from latticebench.diagnosis.modes import Mode
 from latticebench.diagnosis.problem import Problem, derivative_share
@@ -58,6 +59,7 @@ class Diagnosis:
         forecasts: of the held-out data, before and after; one per recording.
         criterion: the Bayesian information criterion less that of the declared equation, before and after.
         declared: coefficients of the declared terms, before and after.
+        inputs: how measured inputs were taken to go on between their samples; "" where the equation has none.
         modes: of the recording, and of the model before and after.
         truth: the true coefficients of the declared terms, or None where they are not known (see `against`).
     """
@@ -79,6 +81,7 @@ class Diagnosis:
     criterion: tuple[float, float]
     declared: tuple[Float[ndarray, " terms"], Float[ndarray, " terms"]]
     modes: tuple[tuple[Mode, ...], tuple[Mode, ...], tuple[Mode, ...]]
+    inputs: str = ""
     truth: Float[ndarray, " terms"] | None = None
 
     def against(self, truth: Float[ndarray, " terms"] | None) -> Diagnosis:
@@ -146,7 +149,7 @@ def diagnose(
         # Models are forecast once, to be named and to be reported.
         @functools.cache
         def foreseen(fitted: Fitted) -> list[Prediction]:
-            return predict(fitted, problem, held_out)
+            return predict(fitted, search.problem, held_out)
 
         recorded = sum(len(one.t) for one in shown)
         try:
@@ -163,9 +166,9 @@ def diagnose(
             if found is None:
                 raise
             plain = Compared(found.models[0], (np.nan,) * len(found.models[0].model.effects), _none_equal(found))
-            raise Interrupted(_diagnosis(problem, found, plain, (), foreseen, recorded)) from None
+            raise Interrupted(_diagnosis(search.problem, found, plain, (), foreseen, recorded)) from None
         search.say("forecasting")
-        return _diagnosis(problem, found, best, left, foreseen, recorded)
+        return _diagnosis(search.problem, found, best, left, foreseen, recorded)
 
 
 def _none_equal(found: Found) -> tuple[tuple[str, ...], ...]:
@@ -249,6 +252,7 @@ def _diagnosis(
         criterion=(0.0, more * float(np.log(after.layout.readings())) - gain),
         declared=both(lambda one: np.array(one.model.coefficients[:count])),
         modes=(modes.of_recording(problem), modes.of_model(before), modes.of_model(after)),
+        inputs=in_words(problem),
     )  # fmt: skip
 
 

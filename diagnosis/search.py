@@ -18,6 +18,7 @@ from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.border import MOST
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.horizon import Layout, unread
+from latticebench.diagnosis.inputs import interpolations, likeliest
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure, estimate
 from latticebench.diagnosis.past import past_of, settled
@@ -185,10 +186,10 @@ class Search:
         further = length * (rules.FASTER if settled else rules.GROWTH)
         return further if further < rules.ALMOST * longest else longest
 
-    def layout(self, length: int) -> Layout:
+    def layout(self, length: int, problem: Problem | None = None) -> Layout:
         """Return pieces of a length: of all rows on long horizons, of some on short ones."""
         most = None if length >= self._longest else max(ROWS, PIECES * length)
-        return Layout.of(self.problem, length, most, self.small)
+        return Layout.of(problem or self.problem, length, most, self.small)
 
     def _first(self, length: int) -> list[Fitted]:
         """Return the declared equation, and the rivals that begin the search."""
@@ -268,8 +269,11 @@ class Search:
         """Return the declared equation and the best models on a longer horizon."""
         self.small = self._small(last.models[0])
         self._choose_structure(last.models[0])
-        layout = self.layout(length)
-        fits = [found for one in last.models if (found := self.carry(one, layout)) is not None]
+        on_inputs = interpolations(self.problem, early=len(last.horizons) == 1)
+        self.problem, best = likeliest(on_inputs, lambda one: self.carry(last.models[0], self.layout(length, one)))
+        layout = self.layout(length) if best is None else best.layout
+        more = (self.carry(one, layout) for one in last.models[1:])
+        fits = [found for found in (best, *more) if found is not None]
         if not fits:
             return []
         plain = next((one for one in fits if not one.model.effects), None) or self.carry(last.before, layout)

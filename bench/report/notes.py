@@ -56,6 +56,8 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
             f"Of {recorded} sample times {used} were looked at: the record is sampled more densely than it moves, "
             "or very long."
         )
+    if diagnosis.inputs:
+        yield f"Between its samples the measured input was taken as {diagnosis.inputs}, which the readings suit best."
 
 
 def _steps(diagnosis: Diagnosis) -> Iterator[str]:
