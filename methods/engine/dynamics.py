@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -161,6 +161,20 @@ class Dynamics:
         if derivatives:
             self._add_slopes(found, windows, coefficients, factors)
         return rate.reshape(y.shape), values, found
+
+    def acting(self, coefficients: Float[ndarray, " terms"]) -> tuple[Dynamics, Float[ndarray, " terms"]]:
+        """Return the equation of the terms whose coefficients are not zero, on the same sites, and these."""
+        kept = np.flatnonzero(coefficients)
+        if len(kept) in (0, len(coefficients)):
+            return self, coefficients
+        fewer = replace(
+            self,
+            terms=tuple(self.terms[k] for k in kept),
+            weights=None if self.weights is None else self.weights[kept],
+            factors=None if self.factors is None else tuple(self.factors[k] for k in kept),
+            least_reach=self.reach,
+        )
+        return fewer, coefficients[kept]
 
     def evaluator(
         self,

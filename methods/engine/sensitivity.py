@@ -127,10 +127,12 @@ class Stretches:
     ) -> Float[ndarray, "stretch state"]:
         """Integrate each stretch in its number of steps; the end is not finite where the motion is unbounded."""
         end = np.empty_like(start)
+        dynamics, coefficients = self.dynamics.acting(coefficients)
+        acting = replace(self, dynamics=dynamics)
         with np.errstate(all="ignore"):
             for count in np.unique(substeps):
                 chosen = np.flatnonzero(substeps == count)
-                end[chosen] = self._march(coefficients, chosen, start[chosen], None, int(count), splines)[0]
+                end[chosen] = acting._march(coefficients, chosen, start[chosen], None, int(count), splines)[0]
         return end
 
     def substeps(
