@@ -17,8 +17,13 @@ STAND_INS = frozenset({"disorder"})
 # leaves just that. Where rounding makes the noise, it leaves lines at any frequency; a wrong equation that an input
 # drives leaves lines wherever the input has some.
 LOCKED = 10.0
-# Effects that feed readings back into the motion: what they bring is such an influence, too.
+# Effects that feed the motion with its own past: what they bring is such an influence, too.
 FED = frozenset({"memory"})
+# A wave or a pulse has to stand out from its surroundings: its price is as many times as high as others beside it win
+# what noise lets them, for where an equation misfits, every frequency or time near by wins something. Beside a wave are
+# those from so many steps of half a resolution away, where a line has fallen to a hundredth, up to so many; beside a
+# pulse are as many of its width that are at least so many widths away. Of fewer the median says nothing.
+LINE, AROUND, APART, FEW_AROUND = 4, 24, 4.0, 8
 # Stretches of the recordings whose numbers are compared: where they differ by more than the noise lets them, all
 # evidence is that much less. Twice as many can hold twice the evidence of what is no noise; a few periods must fit in.
 STRETCHES = 32

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import gammaincinv
 
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Force, Placed
 from latticebench.diagnosis.fitting import Fitted, by_pieces, gain, normal, scaled_inverse, whitened
 from latticebench.diagnosis.horizon import fields, propagate
@@ -35,8 +36,6 @@ CHUNK = 8_000_000
 DIRECTIONS, ALIKE, LIKELIEST = 24, 1e-3, 12
 # Seed of the directions: the same each time, so that a diagnosis is.
 SIGNS = 0
-# Candidates beside one whose median is known to a third.
-FEW_BESIDE = 8
 # Directions that the model can do already, as a share of what a candidate does.
 OLD = 1e-4
 
@@ -209,7 +208,7 @@ class Tangent:
         which every frequency wins something.
         """
         others = placed.beside(candidates)
-        if len(others) < FEW_BESIDE:
+        if len(others) < rules.FEW_AROUND:
             return 1.0
         usual = float(np.median(self._glanced(others)))
         return max(1.0, usual / float(gammaincinv(len(placed.strength) / 2, 0.5)))

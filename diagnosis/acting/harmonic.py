@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting.placed import Chain, Force, Placed, Scene, Summand
 from latticebench.methods.engine.dynamics import Factor
 from latticebench.systems.effects import Effect
@@ -16,9 +17,6 @@ from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     from numpy import ndarray
-
-# Frequencies of the scene, half a resolution apart, that belong to a line, and those that are beside it.
-LINE, FAR = 4, 24
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,7 +64,8 @@ class Harmonic(Placed, acts="harmonic"):
         alike = [one for one in others if isinstance(one, Harmonic) and one.place == self.place]
         alike.sort(key=lambda one: one.omega)
         here = bisect.bisect(alike, self.omega, key=lambda one: one.omega)
-        return [*alike[max(here - FAR, 0) : max(here - LINE, 0)], *alike[here + LINE : here + FAR]]
+        near, far = rules.LINE, rules.AROUND
+        return [*alike[max(here - far, 0) : max(here - near, 0)], *alike[here + near : here + far]]
 
     def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return the waves and, for the frequency, their derivatives by it."""

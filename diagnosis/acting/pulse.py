@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Placed, Scene, Summand
 from latticebench.methods.engine.dynamics import Factor
 from latticebench.systems.effects import Effect
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
 
 # Middles that are tried of each width, at most, and the ratio of one width to the next.
 MOST_MIDDLES, WIDER = 60, 3.0
-# Widths between pulses that hardly overlap, and those beside a pulse that it is compared with.
-APART, BESIDE = 4.0, 24
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,8 +64,8 @@ class Pulse(Placed, acts="pulse"):
         own = max(abs(self.width), 1e-300)
         alike = [one for one in others if isinstance(one, Pulse) and one.place == self.place]
         width = min((one.width for one in alike), key=lambda one: abs(np.log(one / own)), default=own)
-        apart = [one for one in alike if one.width == width and abs(one.at - self.at) > APART * max(own, width)]
-        return sorted(apart, key=lambda one: abs(one.at - self.at))[:BESIDE]
+        apart = [one for one in alike if one.width == width and abs(one.at - self.at) > rules.APART * max(own, width)]
+        return sorted(apart, key=lambda one: abs(one.at - self.at))[: rules.AROUND]
 
     def begun(self, t: float) -> bool:
         """Return whether its middle is before a time: later, its strength is not known."""
