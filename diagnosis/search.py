@@ -32,6 +32,9 @@ Watcher = Callable[[str], None]
 ROWS, PIECES = 1200, 4
 # A size of u that does not matter: a share of the readings at first, then of the noise.
 SMALL_SHARE, SMALL_NOISE = 1e-3, 0.1
+# Errors of the integrator are as much smaller, at the least, as what is left becomes smaller by this factor; and how
+# much larger they may be where a motion is not found at once.
+COARSE, FARTHER = 4.0, 100.0
 # Gauss-Newton steps of a first fit, of one at the next horizon, and of one with an effect more or less.
 FIRST, CARRIED, CHANGED = 40, 25, 10
 # A model that cannot be followed over long pieces at once begins on the second horizon and climbs so many at a time.
@@ -287,8 +290,13 @@ class Search:
             old, valid = fitted.layout.rows[number], fitted.layout.valid[number]
             nodes[old[valid]] = fitted.followed.nodes[number][valid]
             near.append(nodes[rows])
-        ready = layout.with_substeps(fitted.model, near, self.problem.top)
-        return self.refit(fitted.model, ready, near, fitted, steps, hope)
+        for small in (layout.small, FARTHER * layout.small):
+            # From farther away the motion is first followed roughly.
+            ready = replace(layout, small=small).with_substeps(fitted.model, near, self.problem.top)
+            found = self.refit(fitted.model, ready, near, fitted, steps, hope)
+            if found is not None or hope < np.inf:
+                break
+        return found
 
     def refit(
         self,
@@ -305,12 +313,18 @@ class Search:
         splines = start.followed.splines if start is not None and known else None
         with np.errstate(all="ignore"):
             try:
-                return settled(
+                found = settled(
                     self.problem, model, layout, near,
                     structure=self.structure, noise=noise, steps=steps, hope=hope, splines=splines,
                 )  # fmt: skip
             except np.linalg.LinAlgError:
                 return None
+        small = layout.small if found is None else self._small(found)
+        if found is None or small > layout.small / COARSE:
+            return found
+        # What is left has become so little that the integrator's errors count.
+        finer = replace(layout, small=small).with_substeps(found.model, found.followed.nodes, self.problem.top)
+        return self.refit(found.model, finer, found.followed.nodes, found, steps, hope)
 
     # One horizon ------------------------------------------------------------------------------------------------------
 

@@ -94,6 +94,28 @@ def crowding(problem: Problem, fitted: Fitted) -> tuple[float, ...]:
     return tuple(tangent.crowding(one, problem.candidates) for one in fitted.model.effects)
 
 
+def wald(fitted: Fitted, number: int) -> float:
+    """Return the nats that an effect brings as far as the model is linear: half of Wald's statistic.
+
+    What has no strengths is beyond all doubt.
+    """
+    strength = np.array(fitted.model.effects[number].strength)
+    begin = fitted.model.blocks[number].start
+    kept = slice(begin, begin + len(strength))
+    if not len(strength):
+        return float("inf")
+    return float(strength @ np.linalg.pinv(fitted.covariance[kept, kept]) @ strength) / 2
+
+
+def same(one: Fitted, other: Fitted) -> bool:
+    """Return whether two fits say the same of the readings."""
+    levels = one.followed.level, other.followed.level
+    if abs(one.cost - other.cost) > SAME_COST or levels[0].shape != levels[1].shape:
+        return False
+    size = other.noise.deviation()[other.rows.sensor]
+    return float(np.sqrt(np.nanmean(((levels[0] - levels[1]) / size) ** 2))) < SAME_READING
+
+
 @dataclass(frozen=True, eq=False)
 class Worth:
     """What models are worth beside the best of them, whose misfit says how much evidence counts.
