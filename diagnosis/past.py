@@ -53,5 +53,5 @@ def settled(
         if found is None or abs(found.cost - last) < SETTLED:
             return found
         model, near, last = found.model, found.followed.nodes, found.cost
-        settings |= {"noise": found.noise, "splines": found.followed.splines}
+        settings.update(noise=found.noise, splines=found.followed.splines)
     return found
