@@ -202,11 +202,7 @@ class Tangent:
         return [one for few in kept.values() for one in few[:LIKELIEST]]
 
     def crowding(self, placed: Placed, candidates: Sequence[Placed]) -> float:
-        """Return how many times as many nats as noise lets them those beside a candidate win, at least 1.
-
-        A line is one where it stands out from its surroundings. What an equation misfits has a spectrum of its own, in
-        which every frequency wins something.
-        """
+        """Return how many times as many nats as noise lets them those beside a candidate win, at least 1."""
         others = placed.beside(candidates)
         if len(others) < rules.FEW_AROUND:
             return 1.0

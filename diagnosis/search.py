@@ -24,17 +24,16 @@ from latticebench.diagnosis.noise import Structure, estimate
 from latticebench.diagnosis.past import past_of, settled
 from latticebench.diagnosis.problem import Problem, regressed, turned
 from latticebench.diagnosis.score import Scored, Tangent
-from latticebench.diagnosis.worth import COUPLING, Worth, beyond, misfits, over, repelling, same, wald
+from latticebench.diagnosis.worth import (
+    COUPLING, SMALL_SHARE, Worth, beyond, fine, misfits, over, repelling, same, wald,
+)  # fmt: skip
 
 Watcher = Callable[[str], None]
 
 # On short horizons so many rows are looked at, or so many pieces' worth if that is more.
 ROWS, PIECES = 1200, 4
-# A size of u that does not matter: a share of the readings at first, then of the noise.
-SMALL_SHARE, SMALL_NOISE = 1e-3, 0.1
-# Errors of the integrator are as much smaller, at the least, as what is left becomes smaller by this factor; and how
-# much larger they may be where a motion is not found at once.
-COARSE, FARTHER = 4.0, 100.0
+# Errors of the integrator become smaller where what is left does by this factor.
+FINER = 4.0
 # Gauss-Newton steps of a first fit, of one at the next horizon, and of one with an effect more or less.
 FIRST, CARRIED, CHANGED = 40, 25, 10
 # A model that cannot be followed over long pieces at once begins on the second horizon and climbs so many at a time.
@@ -209,7 +208,7 @@ class Search:
             fits += [found] if found is not None else []
         if not fits:
             return []
-        self.small = self._small(fits[0])
+        self.small = fine(self.problem, fits[0])
         self._choose_structure(fits[0])
         return [fits[0], *fits]
 
@@ -255,11 +254,6 @@ class Search:
                 if found is not None:
                     yield found
 
-    def _small(self, fitted: Fitted) -> float:
-        """Return a size of u that does not matter beside the noise of the best sensor where the signal is least."""
-        least = min(float(np.nanmin(fitted.rms)), float(np.nanmin(fitted.noise.deviation())))
-        return max(SMALL_NOISE * least, 1e-3 * SMALL_SHARE * self.problem.height)
-
     def _choose_structure(self, fitted: Fitted) -> None:
         """Let the readings choose the parts of the noise model that all models of a horizon share."""
         followed = fitted.followed
@@ -270,7 +264,7 @@ class Search:
 
     def _carried(self, last: Found, length: int) -> list[Fitted]:
         """Return the declared equation and the best models on a longer horizon."""
-        self.small = self._small(last.models[0])
+        self.small = fine(self.problem, last.models[0])
         self._choose_structure(last.models[0])
         on_inputs = interpolations(self.problem, early=len(last.horizons) == 1)
         self.problem, best = likeliest(on_inputs, lambda one: self.carry(last.models[0], self.layout(length, one)))
@@ -290,13 +284,8 @@ class Search:
             old, valid = fitted.layout.rows[number], fitted.layout.valid[number]
             nodes[old[valid]] = fitted.followed.nodes[number][valid]
             near.append(nodes[rows])
-        for small in (layout.small, FARTHER * layout.small):
-            # From farther away the motion is first followed roughly.
-            ready = replace(layout, small=small).with_substeps(fitted.model, near, self.problem.top)
-            found = self.refit(fitted.model, ready, near, fitted, steps, hope)
-            if found is not None or hope < np.inf:
-                break
-        return found
+        ready = layout.with_substeps(fitted.model, near, self.problem.top)
+        return self.refit(fitted.model, ready, near, fitted, steps, hope)
 
     def refit(
         self,
@@ -319,8 +308,8 @@ class Search:
                 )  # fmt: skip
             except np.linalg.LinAlgError:
                 return None
-        small = layout.small if found is None else self._small(found)
-        if found is None or small > layout.small / COARSE:
+        small = layout.small if found is None else fine(self.problem, found)
+        if found is None or small > layout.small / FINER:
             return found
         # What is left has become so little that the integrator's errors count.
         finer = replace(layout, small=small).with_substeps(found.model, found.followed.nodes, self.problem.top)

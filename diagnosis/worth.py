@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 COUPLING = "u[n+1]+u[n-1]-2*u[n]"
 # Models whose costs and readings differ by less (nats; share of the noise) are one model said in two ways.
 SAME_COST, SAME_READING = 0.3, 0.05
+# A size of u that does not matter: a share of the readings at first, then of the noise.
+SMALL_SHARE, SMALL_NOISE = 1e-3, 0.1
 
 
 def over(problem: Problem, fitted: Fitted) -> Float[ndarray, " sensors"]:
@@ -33,6 +35,12 @@ def over(problem: Problem, fitted: Fitted) -> Float[ndarray, " sensors"]:
 def beyond(problem: Problem, fitted: Fitted) -> float:
     """Return how many times the noise that the readings show a model leaves, at the sensor where that is most."""
     return float(np.nanmax(over(problem, fitted), initial=0.0))
+
+
+def fine(problem: Problem, fitted: Fitted) -> float:
+    """Return a size of u that does not matter beside the noise of the best sensor where the signal is least."""
+    least = min(float(np.nanmin(fitted.rms)), float(np.nanmin(fitted.noise.deviation())))
+    return max(SMALL_NOISE * least, 1e-3 * SMALL_SHARE * problem.height)
 
 
 def lost(problem: Problem, fitted: Fitted) -> bool:
@@ -92,28 +100,6 @@ def crowding(problem: Problem, fitted: Fitted) -> tuple[float, ...]:
         return (1.0,) * len(fitted.model.effects)
     tangent = Tangent(fitted)
     return tuple(tangent.crowding(one, problem.candidates) for one in fitted.model.effects)
-
-
-def wald(fitted: Fitted, number: int) -> float:
-    """Return the nats that an effect brings as far as the model is linear: half of Wald's statistic.
-
-    What has no strengths is beyond all doubt.
-    """
-    strength = np.array(fitted.model.effects[number].strength)
-    begin = fitted.model.blocks[number].start
-    kept = slice(begin, begin + len(strength))
-    if not len(strength):
-        return float("inf")
-    return float(strength @ np.linalg.pinv(fitted.covariance[kept, kept]) @ strength) / 2
-
-
-def same(one: Fitted, other: Fitted) -> bool:
-    """Return whether two fits say the same of the readings."""
-    levels = one.followed.level, other.followed.level
-    if abs(one.cost - other.cost) > SAME_COST or levels[0].shape != levels[1].shape:
-        return False
-    size = other.noise.deviation()[other.rows.sensor]
-    return float(np.sqrt(np.nanmean(((levels[0] - levels[1]) / size) ** 2))) < SAME_READING
 
 
 @dataclass(frozen=True, eq=False)
