@@ -25,7 +25,16 @@ from latticebench.diagnosis.past import past_of, settled
 from latticebench.diagnosis.problem import Problem, regressed, turned
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.worth import (
-    COUPLING, SMALL_SHARE, Worth, beyond, fine, misfits, over, repelling, same, wald,
+    COUPLING,
+    SMALL_SHARE,
+    Worth,
+    beyond,
+    fine,
+    misfits,
+    over,
+    repelling,
+    same,
+    wald,
 )  # fmt: skip
 
 Watcher = Callable[[str], None]
@@ -42,7 +51,6 @@ CLIMBING = 2
 DOUBT = 8.0
 # Derivatives of the states of one piece by the numbers of its border, at most: they grow as the square of its length.
 MOST_MOVES = 5e6
-
 # A candidate may take the place of an effect if it can do this share of what the effect does.
 MOST_OF_IT = 0.9
 # Sensors are tried from the other side on chains of so many sites at most.
