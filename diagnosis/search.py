@@ -35,7 +35,7 @@ from latticebench.diagnosis.worth import (
     repelling,
     same,
     wald,
-)  # fmt: skip
+)
 
 Watcher = Callable[[str], None]
 
