@@ -24,18 +24,7 @@ from latticebench.diagnosis.noise import Structure, estimate
 from latticebench.diagnosis.past import past_of, settled
 from latticebench.diagnosis.problem import Problem, regressed, turned
 from latticebench.diagnosis.score import Scored, Tangent
-from latticebench.diagnosis.worth import (
-    COUPLING,
-    SMALL_SHARE,
-    Worth,
-    beyond,
-    fine,
-    misfits,
-    over,
-    repelling,
-    same,
-    wald,
-)
+from latticebench.diagnosis.worth import COUPLING, Worth, beyond, fine, misfits, over, repelling, same, wald
 
 Watcher = Callable[[str], None]
 
@@ -110,7 +99,7 @@ class Search:
     def __init__(self, problem: Problem, watcher: Watcher) -> None:
         self.problem, self.say = problem, watcher
         self.structure = Structure()
-        self.small = SMALL_SHARE * problem.height
+        self.small = fine(problem)
         self.tried: dict[tuple[str, ...], tuple[Tried, ...]] = {}
         self.open: tuple[Placed, ...] = problem.candidates
         self.lengths: list[int] = []

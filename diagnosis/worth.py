@@ -37,8 +37,13 @@ def beyond(problem: Problem, fitted: Fitted) -> float:
     return float(np.nanmax(over(problem, fitted), initial=0.0))
 
 
-def fine(problem: Problem, fitted: Fitted) -> float:
-    """Return a size of u that does not matter beside the noise of the best sensor where the signal is least."""
+def fine(problem: Problem, fitted: Fitted | None = None) -> float:
+    """Return a size of u that does not matter beside the noise of the best sensor where the signal is least.
+
+    Before anything is fitted it is a share of the readings.
+    """
+    if fitted is None:
+        return SMALL_SHARE * problem.height
     least = min(float(np.nanmin(fitted.rms)), float(np.nanmin(fitted.noise.deviation())))
     return max(SMALL_NOISE * least, 1e-3 * SMALL_SHARE * problem.height)
 
