@@ -19,7 +19,8 @@ from latticebench.diagnosis.inputs import in_words
 from latticebench.diagnosis.instrument import describe
 from latticebench.diagnosis.modes import Mode
 from latticebench.diagnosis.problem import Problem, derivative_share
-from latticebench.diagnosis.search import Found, Horizon, Search, Watcher
+from latticebench.diagnosis.progress import Found, Horizon
+from latticebench.diagnosis.search import Search, Watcher
 from latticebench.diagnosis.unnamed import Left, without_name
 from latticebench.diagnosis.worth import lost
 from latticebench.methods.method import check_fit

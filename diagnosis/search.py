@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure, estimate
 from latticebench.diagnosis.past import past_of, settled
 from latticebench.diagnosis.problem import Problem, regressed, turned
+from latticebench.diagnosis.progress import Found, Horizon, Tried
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.worth import COUPLING, Worth, beyond, fine, misfits, over, repelling, same, wald
 
@@ -50,47 +51,6 @@ NEAR = 2.0
 FEW_SENSORS = 8
 
 Pool = dict[tuple[str, ...], Fitted]
-
-
-@dataclass(frozen=True)
-class Tried:
-    """A candidate of the best model of a horizon: its score, and the nats that it had to bring."""
-
-    name: str
-    gain: float
-    price: float
-
-
-@dataclass(frozen=True)
-class Horizon:
-    """A horizon that the search has been through.
-
-    Attributes:
-        samples: rows of the longest piece.
-        periods: its length in periods of the main frequency.
-        models: effects of the models that went on, and how many nats each was behind the best.
-        tried: candidates of the best model, the best first.
-    """
-
-    samples: int
-    periods: float
-    models: tuple[tuple[tuple[str, ...], float], ...]
-    tried: tuple[Tried, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """How far a search has come.
-
-    Attributes:
-        before: the declared equation on the longest horizon on which it could be followed.
-        models: the best models on the last horizon, the best first.
-        horizons: those that were gone through.
-    """
-
-    before: Fitted
-    models: tuple[Fitted, ...]
-    horizons: tuple[Horizon, ...]
 
 
 class Search:

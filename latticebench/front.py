@@ -13,7 +13,7 @@ Results show themselves in a notebook as tables or pages; tables are pandas Data
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
