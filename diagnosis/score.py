@@ -183,11 +183,14 @@ class Tangent:
             block, strength = model.blocks[number], np.array(model.effects[number].strength)
             kept[block] = False
             done += self.free[:, block.start : block.start + len(strength)] @ strength
+        basis = _orthonormal(self.free[:, kept])
+        own = done - basis @ (basis.T @ done)
+        return self._other(self.left + own, basis, float(own @ own))
+
+    def _other(self, left: ndarray, basis: ndarray, taken: float = 0.0) -> Tangent:
         other = copy.copy(self)
         other.__dict__.pop("_duals", None)
-        other.courses, other.basis = {}, _orthonormal(self.free[:, kept])
-        own = done - other.basis @ (other.basis.T @ done)
-        other.left, other.taken = self.left + own, float(own @ own)
+        other.courses, other.left, other.basis, other.taken = {}, left, basis, taken
         return other
 
     def likeliest(
@@ -206,7 +209,10 @@ class Tangent:
         others = placed.beside(candidates)
         if len(others) < rules.FEW_AROUND:
             return 1.0
-        usual = float(np.median(self._glanced(others)))
+        # What it does itself is left to it: a line has wings.
+        basis = _orthonormal(np.concatenate([self.free, self._responses([placed]).columns], axis=1))
+        rest = self._other(self.left - basis @ (basis.T @ self.left), basis)
+        usual = float(np.median(rest._glanced(others)))
         return max(1.0, usual / float(gammaincinv(len(placed.strength) / 2, 0.5)))
 
     def _glanced(self, candidates: Sequence[Placed]) -> list[float]:
@@ -310,7 +316,7 @@ class Tangent:
         near = []
         for number, (local, inverse, push) in enumerate(zip(self.local, self.inverse, pushed, strict=True)):
             error = self.solved.error[number] - self.solved.slope[number][:, :, local.shape[2] :] @ change - push
-            states = (inverse @ _across(local, error)[..., None])[..., 0]
+            states = (inverse @ (np.swapaxes(local, 1, 2) @ error[..., None]))[..., 0]
             varied = np.concatenate([states, np.broadcast_to(change, (len(states), len(change)))], axis=1)
             nodes, moves = self.fitted.followed.nodes[number], self.fitted.followed.moves[number]
             near.append(nodes + (varied[:, None, None] @ moves)[:, :, 0])
@@ -480,11 +486,6 @@ class Tangent:
             wide = replace(base, least_reach=(left, right))
             self.evaluators[number, reach] = wide.evaluator(along.t, along.states, self._input(number), along.driven)
         return self.evaluators[number, reach]
-
-
-def _across(local: ndarray, readings: ndarray) -> ndarray:
-    """Return the products of readings (pieces, R) with what states do to them (pieces, R, S)."""
-    return np.asarray((np.swapaxes(local, 1, 2) @ readings[..., None])[..., 0])
 
 
 def _columns_of(one: Placed) -> int:

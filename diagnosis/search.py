@@ -449,7 +449,7 @@ class Search:
             price = self.problem.price(name, one.freedom) + self.problem.locked(one.placed)
             if name not in tried or one.gain - price > tried[name].gain - tried[name].price:
                 tried[name] = Tried(name, one.gain, price)
-            if one.placed.frequency is not None:
+            if one.placed.frequency is not None and one.gain > price:
                 price *= max(1.0, tangent.crowding(one.placed, self.open) / fitted.dispersion)
             key = one.placed.place
             least = max(price, own.price_of(one.placed) * fitted.dispersion / rules.UNDERSTATED)

@@ -155,7 +155,7 @@ def test_a_figure_of_a_run_is_the_picture_that_its_place_says(run: Run, tmp_path
     assert run("run", "s.toml", "--jobs", "1", "--results", "store")[0] == 0
     assert run("figures", "store", "--only", "errors", "--out", "errors.png") == (0, "")
     assert (tmp_path / "errors.png").read_bytes().startswith(FIRST[".png"])
-    for out, reason in (("all.png", "there are 2 figures"), ("errors.svg", "unknown ending '.svg'")):
+    for out, reason in (("all.png", "there are 2 figures"), ("errors.gif", "'.gif'")):
         code, said = run("figures", "store", "--out", out)
         assert (code, reason in said) == (2, True)
         assert not (tmp_path / out).exists()
