@@ -209,10 +209,9 @@ class Tangent:
         others = placed.beside(candidates)
         if len(others) < rules.FEW_AROUND:
             return 1.0
-        # What it does itself is left to it: a line has wings.
+        # A line has wings.
         basis = _orthonormal(np.concatenate([self.free, self._responses([placed]).columns], axis=1))
-        rest = self._other(self.left - basis @ (basis.T @ self.left), basis)
-        usual = float(np.median(rest._glanced(others)))
+        usual = float(np.median(self._other(self.left - basis @ (basis.T @ self.left), basis)._glanced(others)))
         return max(1.0, usual / float(gammaincinv(len(placed.strength) / 2, 0.5)))
 
     def _glanced(self, candidates: Sequence[Placed]) -> list[float]:
