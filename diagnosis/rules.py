@@ -8,8 +8,9 @@ Evidence is in nats: natural logarithms of likelihood ratios. `results/loop/rule
 FALSE_ALARM = 0.005
 # Chance that such a diagnosis finds something without a name.
 FALSE_DOUBT = 0.005
-# Nats by which something without a name must be better than named effects in their place to cast doubt on them.
-NAMED = 3.0
+# Nats by which something without a name must be better than named effects in their place to cast doubt on them: that an
+# effect has a name makes it so much likelier before anything is read.
+NAMED = 5.0
 # Nats that an effect must bring besides if it has a number of its own for every site: it does the work of many others.
 STAND_IN = 10.0
 STAND_INS = frozenset({"disorder"})
