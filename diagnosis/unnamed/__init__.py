@@ -13,6 +13,7 @@ from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.search import Search
 from latticebench.diagnosis.unnamed import forces, readings
+from latticebench.diagnosis.unnamed.nameless import Nameless
 
 # What could do better than named effects is fitted in full: the likeliest ones, so many of each set of effects. Sets of
 # so many are looked at, and all together.
@@ -94,7 +95,7 @@ def without_name(search: Search, fitted: Fitted) -> tuple[Left, ...]:
             if found.worse < SLACK + INEXACT * tangents[number].taken / 2:
                 instead.setdefault(found.numbers, []).append(found)
         elif one.gain > price:
-            left.append(Left(_said(one.placed), one.gain, price, one.placed.site))
+            left.append(Left(_nameless(one.placed).said, one.gain, price, one.placed.site))
     likely = [one for found in instead.values() for one in sorted(found, key=lambda one: one.worse)[:OF_EACH]]
     best: dict[tuple[str, int | None], Left] = {}
     for thing in sorted(left, key=lambda left: left.price - left.gain):
@@ -142,10 +143,10 @@ def _better(search: Search, fitted: Fitted, likely: list[_Instead]) -> list[Left
         better = (hope - other.cost) / fitted.dispersion
         names = tuple(fitted.model.effects[k].effect.name for k in one.numbers)
         if better > max(rules.NAMED, found[one.numbers].gain if one.numbers in found else 0.0):
-            found[one.numbers] = Left(_said(one.placed), better, rules.NAMED, one.placed.site, names)
+            found[one.numbers] = Left(_nameless(one.placed).said, better, rules.NAMED, one.placed.site, names)
     return sorted(found.values(), key=lambda left: -left.gain)
 
 
-def _said(placed: Placed) -> str:
-    assert isinstance(placed, forces.Pushed | readings.Misread)
-    return placed.said
+def _nameless(placed: Placed) -> Nameless:
+    assert isinstance(placed, Nameless)
+    return placed

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.acting import Chain, Force, Placed, Scene
+from latticebench.diagnosis.acting import Chain, Force
 from latticebench.diagnosis.acting.harmonic import wave
 from latticebench.diagnosis.unnamed.course import Course, courses, growing
+from latticebench.diagnosis.unnamed.nameless import EFFECT, Nameless
 from latticebench.methods.engine.dynamics import Factor
-from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
@@ -57,37 +57,14 @@ MOST_FREQUENCIES = 200
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Pushed(Placed):
+class Pushed(Nameless):
     """Forces, each with the strength of a number: strength * weights[n] * factor(t) * text.
 
     Attributes:
-        said: in words.
         parts: of each number.
-        here: the only site, from 0; None where there is no such site.
     """
 
-    said: str
     parts: tuple[tuple[Force, ...], ...]
-    here: int | None = None
-
-    @classmethod
-    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:  # noqa: ARG003
-        """Return nothing: it is in no catalogue."""
-        return iter(())
-
-    @property
-    def site(self) -> int | None:
-        """The only site, from 0."""
-        return self.here
-
-    @property
-    def place(self) -> tuple[object, ...]:
-        """What it is, and where."""
-        return (self.said, self.here)
-
-    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
-        """Return what it is."""
-        return tuple(self.said for _ in self.parts)
 
     def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return the forces with their strengths."""
@@ -212,7 +189,7 @@ def _of(chain: Chain, said: str, parts: Sequence[tuple[Force, ...]], here: int |
     """Return forces with a strength each, of a complex field with one for either part."""
     turned = [tuple(replace(one, text=f"i*({one.text})") for one in several) for several in parts]
     every = (*parts, *(turned if chain.is_complex else ()))
-    return Pushed(effect=Effect("unnamed", "1"), said=said, parts=every, here=here, strength=(0.0,) * len(every))
+    return Pushed(effect=EFFECT, said=said, parts=every, here=here, strength=(0.0,) * len(every))
 
 
 def _base(problem: Problem) -> list[str]:

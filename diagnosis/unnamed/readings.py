@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting import Chain, Misreading, Placed, Scene
+from latticebench.diagnosis.acting import Misreading
 from latticebench.diagnosis.unnamed.course import Course, courses, growing
-from latticebench.systems.effects import Effect
+from latticebench.diagnosis.unnamed.nameless import EFFECT, Nameless
 
 if TYPE_CHECKING:
     from numpy import ndarray
@@ -27,40 +27,22 @@ its derivative by the reading's own field."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Misread(Placed):
+class Misread(Nameless):
     """A sum of errors of the readings, each with a strength.
 
     Attributes:
-        said: in words.
         added: what each adds.
-        here: the only sensor's site, from 0; None where there is no such site.
         both: whether the velocity is that of the wrong reading, too.
     """
 
-    said: str
     added: tuple[Reading, ...]
-    here: int | None = None
     both: bool = False
     instrument: ClassVar[bool] = True
 
-    @classmethod
-    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:  # noqa: ARG003
-        """Return nothing: it is in no catalogue."""
-        return iter(())
-
-    @property
-    def site(self) -> int | None:
-        """The only site, from 0."""
-        return self.here
-
     @property
     def place(self) -> tuple[object, ...]:
-        """What it is, and where."""
-        return (self.said, self.here, self.both)
-
-    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
-        """Return what it is."""
-        return tuple(self.said for _ in self.added)
+        """What it is, where, and whether the velocity is that of the wrong reading."""
+        return (*super().place, self.both)
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:
         """Return what the errors add."""
@@ -124,7 +106,7 @@ def _between(problem: Problem) -> Iterator[Misread]:
 
 def _misread(said: str, added: Sequence[Reading], here: int | None = None, *, both: bool = False) -> Misread:
     return Misread(
-        effect=Effect("unnamed", "1"), said=said, added=tuple(added), here=here, both=both, strength=(0.0,) * len(added)
+        effect=EFFECT, said=said, added=tuple(added), here=here, both=both, strength=(0.0,) * len(added)
     )  # fmt: skip
 
 
