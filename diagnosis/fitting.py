@@ -204,7 +204,7 @@ class Fitted:
     """
 
     layout: Layout
-    followed: Followed
+    followed: Path
     noise: Noise
     cost: float
     covariance: Float[ndarray, "numbers numbers"]
@@ -216,6 +216,12 @@ class Fitted:
     def model(self) -> Model:
         """The model with its numbers."""
         return self.followed.model
+
+    def linearised(self) -> Followed:
+        """Return the derivatives of the motion, computed anew: they take as much memory as hundreds of motions."""
+        found = linearised(self.followed, self.layout)
+        assert found is not None, "a fit ends where they are finite"
+        return found
 
     @property
     def chain(self) -> Chain:
@@ -332,7 +338,7 @@ def fit(
     covariance = solved.covariance() * spread(error, robust, noise.tail) * dispersion
     if not np.all(np.isfinite(covariance)):
         return None
-    return Fitted(layout, followed, noise, cost, covariance, dispersion, converged, rows)
+    return Fitted(layout, followed.path, noise, cost, covariance, dispersion, converged, rows)
 
 
 def spread(error: ndarray, robust: ndarray, tail: float) -> float:

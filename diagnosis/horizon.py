@@ -20,6 +20,7 @@ from latticebench.diagnosis.border import Border, borders
 from latticebench.diagnosis.model import Assembled, Model
 from latticebench.diagnosis.noise import Rows
 from latticebench.diagnosis.problem import Problem
+from latticebench.diagnosis.propagation import propagate
 from latticebench.methods.engine.dynamics import Dynamics
 from latticebench.methods.engine.record import Record
 from latticebench.methods.engine.sensitivity import Stretches, Transition
@@ -43,8 +44,6 @@ FEWEST_ROWS = 3
 TOGETHER = 3.0
 # Noise is at least this share of a converter's step: where a motion stands still, readings repeat exactly.
 ROUNDING = 0.2
-# Pieces of more intervals are propagated in blocks where there are few of them.
-LONG_PIECE, FEW_PIECES = 200, 32
 # Newton steps that undo what instruments do, and the least slope of a reading that can be undone.
 UNREAD, LEAST_SLOPE = 6, 0.05
 
@@ -245,6 +244,11 @@ class Followed(Path):
     slope: Float[ndarray, "rows channels varied"]
 
     @property
+    def path(self) -> Path:
+        """The motion alone."""
+        return Path(self.model, self.nodes, self.splines, self.level, self.left, self.own)
+
+    @property
     def local(self) -> int:
         """The number L of a piece's own numbers."""
         return int(self.slope.shape[-1]) - len(self.model.numbers)
@@ -400,48 +404,6 @@ def _moves(transition: Transition, by_state: ndarray, assembled: Assembled, bord
     first = np.zeros((pieces, wide.shape[2], size))
     first[:, :size] = np.eye(size)
     return propagate(by_state, wide, first)
-
-
-def propagate(
-    by_state: Float[ndarray, "pieces intervals state state"],
-    forced: Float[ndarray, "pieces intervals columns state"],
-    first: Float[ndarray, "pieces columns state"],
-) -> Float[ndarray, "pieces m columns state"]:
-    """Return z_{j+1} = z_j by_state_j + forced_j, beginning with `first`.
-
-    Long pieces are worked on in blocks side by side, which are joined afterwards.
-    """
-    pieces, intervals, size = by_state.shape[:3]
-    if intervals > LONG_PIECE and pieces < FEW_PIECES:
-        return _in_blocks(by_state, forced, first)
-    z = np.empty((pieces, intervals + 1, first.shape[1], size))
-    z[:, 0] = first
-    for j in range(intervals):
-        z[:, j + 1] = z[:, j] @ by_state[:, j] + forced[:, j]
-    return z
-
-
-def _in_blocks(by_state: ndarray, forced: ndarray, first: ndarray) -> ndarray:
-    pieces, intervals, size = by_state.shape[:3]
-    columns, length = first.shape[1], round(intervals**0.5)
-    blocks = -(-intervals // length)
-    spare = blocks * length - intervals
-    still = np.broadcast_to(np.eye(size), (pieces, spare, size, size))
-    through = np.concatenate([by_state, still], axis=1).reshape(pieces * blocks, length, size, size)
-    push = np.concatenate([forced, np.zeros((pieces, spare, columns, size))], axis=1)
-    wide = np.concatenate(
-        [np.zeros((pieces * blocks, length, size, size)), push.reshape(-1, length, columns, size)], axis=2
-    )
-    begin = np.concatenate([np.eye(size), np.zeros((columns, size))])
-    own = propagate(through, wide, np.broadcast_to(begin, (pieces * blocks, *begin.shape)))
-    own = own.reshape(pieces, blocks, length + 1, size + columns, size)
-    starts = np.empty((pieces, blocks, columns, size))
-    starts[:, 0] = first
-    for k in range(blocks - 1):
-        starts[:, k + 1] = starts[:, k] @ own[:, k, -1, :size] + own[:, k, -1, size:]
-    z = starts[:, :, None] @ own[:, :, :, :size] + own[:, :, :, size:]
-    inner = z[:, :, :-1].reshape(pieces, blocks * length, columns, size)
-    return np.asarray(np.concatenate([inner, z[:, -1:, -1]], axis=1)[:, : intervals + 1])
 
 
 def fields(

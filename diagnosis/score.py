@@ -19,8 +19,9 @@ from scipy.special import gammaincinv
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Force, Placed
 from latticebench.diagnosis.fitting import Fitted, by_pieces, gain, normal, scaled_inverse, whitened
-from latticebench.diagnosis.horizon import fields, propagate
+from latticebench.diagnosis.horizon import fields
 from latticebench.diagnosis.model import Assembled, Model, read_term
+from latticebench.diagnosis.propagation import propagate
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from latticebench.systems.terms import Term
 
 # Numbers that are worked on at a time.
-CHUNK = 8_000_000
+CHUNK = 2_000_000
 # Random directions of readings that a force's curvature is estimated from, directions of its numbers that are one, and
 # candidates of a kind whose score is then computed.
 DIRECTIONS, ALIKE, LIKELIEST = 24, 1e-3, 12
@@ -100,12 +101,12 @@ class Tangent:
 
     def __init__(self, fitted: Fitted) -> None:
         self.fitted = fitted
-        layout, followed = fitted.layout, fitted.followed
+        layout, self.followed = fitted.layout, fitted.linearised()
+        followed = self.followed
         self.whitener, self.error, slope, self.robust = whitened(followed, fitted.noise, fitted.rows)
         self.along = [self._along(number) for number in range(len(layout.records))]
         self.solved = normal(layout, self.error, slope, followed.local, 0.0)
-        size, left, free = followed.local, [], []
-        self.local, self.inverse = [], []
+        size, left, free, self.local, self.inverse = followed.local, [], [], [], []
         for by, error, inner in zip(self.solved.slope, self.solved.error, self.solved.inner, strict=True):
             local = by[:, :, :size]
             unit, divided = scaled_inverse(np.swapaxes(local, 1, 2) @ local, 0.0)
@@ -127,7 +128,7 @@ class Tangent:
         self.evaluators: dict[tuple[int, tuple[int, int]], Callable[[Term], ndarray]] = {}
 
     def _along(self, number: int) -> _Along:
-        layout, followed = self.fitted.layout, self.fitted.followed
+        layout, followed = self.fitted.layout, self.followed
         chain, rows = layout.chain, layout.rows[number]
         assembled = followed.model.assembled(layout.plain, chain, number)
         dynamics, record = assembled.dynamics, layout.records[number]
@@ -277,13 +278,12 @@ class Tangent:
     def _dual(self, number: int, readings: ndarray) -> ndarray:
         """Return derivatives by forces from those by the readings' fields (rows, channels, 1 + D)."""
         layout, along, chain = self.fitted.layout, self.along[number], self.fitted.chain
-        pieces, m = layout.rows[number].shape
-        count = readings.shape[-1]
+        (pieces, m), count = layout.rows[number].shape, readings.shape[-1]
         fields = readings.reshape(pieces, m, chain.levels, chain.parts, chain.sites, count)[..., layout.plain.moving, :]
         by_state = np.zeros((pieces, m, count, chain.order, *fields.shape[3:5]))
         by_state[:, :, :, : chain.levels] = np.moveaxis(fields, -1, 2)
         by_state = by_state.reshape(pieces, m, count, -1)
-        back = np.swapaxes(self.fitted.followed.transitions[number][:, ::-1], 2, 3)
+        back = np.swapaxes(self.followed.transitions[number][:, ::-1], 2, 3)
         carried = propagate(back, by_state[:, -2::-1], by_state[:, -1])[:, ::-1]
         dual = np.zeros((pieces, m, chain.parts, len(chain.moving), count))
         dual[:, :-1] += np.einsum("pjqns,pjks->pjqnk", along.early, carried[:, 1:], optimize=True)
@@ -317,7 +317,7 @@ class Tangent:
             error = self.solved.error[number] - self.solved.slope[number][:, :, local.shape[2] :] @ change - push
             states = (inverse @ (np.swapaxes(local, 1, 2) @ error[..., None]))[..., 0]
             varied = np.concatenate([states, np.broadcast_to(change, (len(states), len(change)))], axis=1)
-            nodes, moves = self.fitted.followed.nodes[number], self.fitted.followed.moves[number]
+            nodes, moves = self.followed.nodes[number], self.followed.moves[number]
             near.append(nodes + (varied[:, None, None] @ moves)[:, :, 0])
             if not placed.instrument:
                 near[-1] += (own @ self._moved(number, [placed])).reshape(nodes.shape)
@@ -427,7 +427,7 @@ class Tangent:
         forced = np.einsum("cpjqn,pjqns->pjcs", push[:, :, :-1], along.early, optimize=True)
         forced += np.einsum("cpjqn,pjqns->pjcs", push[:, :, 1:], along.late, optimize=True)
         still = np.zeros((rows.shape[0], len(push), along.states.shape[1]))
-        z = propagate(self.fitted.followed.transitions[number], forced, still)
+        z = propagate(self.followed.transitions[number], forced, still)
         return z.reshape(rows.size, len(push), -1)
 
     def _own(self, number: int) -> ndarray:
