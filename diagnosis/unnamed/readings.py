@@ -61,7 +61,6 @@ def readings(problem: Problem) -> Iterator[Misread]:
     chain = problem.chain
     grows = _in_time(growing(problem.scene))
     for here in range(chain.sites):
-        yield _misread("a zero that drifts", [_of_part(grows, k) for k in range(chain.parts)], here)
         yield _misread("a gain that drifts", [_times(grows)], here)
         if chain.levels > 1:
             yield _misread("a reading that lags", [_rate], here)

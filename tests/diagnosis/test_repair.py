@@ -79,6 +79,18 @@ def test_what_a_laboratory_recording_lacks_is_named_and_nothing_else(lab):
     assert found.against(recording.coefficients).coefficients[1] < 0.05
 
 
+def test_a_zero_that_drifts_is_named_with_its_sensor_and_how_far_it_goes():
+    recording = made(NONE)
+    read, far = recording.samples, 6 * recording.noise[1]
+    off = np.outer((read.t - read.t[0]) / (read.t[-1] - read.t[0]), [0.0, far])
+    found = diagnosed_as(recording, replace(read, u=read.u + off))
+    (one,) = found.findings
+    assert (one.name, one.site, found.verdict) == ("sensor-drift", 1, "explained")
+    ((size, error),) = one.values.values()
+    assert abs(size - far) < 4 * error < far
+    assert found.residual[1] == pytest.approx(1, abs=0.1)
+
+
 @pytest.mark.parametrize("lab", [NONE, slow(SPIKES)], ids=str)
 def test_where_nothing_is_missing_nothing_is_named(lab):
     found = diagnosed(lab)

@@ -14,7 +14,7 @@ EXPECTED = """
 damping quadratic-drag dry-friction onsite-linear onsite-quadratic onsite-cubic onsite-quintic constant-force drive
 parametric-drive known-input gradient trap memory kick next-neighbour nonlinear-coupling asymmetric-coupling
 intersite-nonlinearity long-range nonlinear-loss gain-loss defect unequal-masses ends disorder sensor-offset sensor-gain
-sensor-curve clock
+sensor-curve sensor-drift clock
 """
 LATTICES = [(1, False), (1, True), (2, False), (2, True)]
 

@@ -84,6 +84,7 @@ MISREADINGS = {
     "sensor-offset": _misread(instrument.offset),
     "sensor-gain": _misread(instrument.gain),
     "sensor-curve": _misread(instrument.curve),
+    "sensor-drift": _misread(instrument.drift),
     # Where only u is read, another unit of time does the same.
     "clock": replace(_misread(instrument.slow_clock), only="second order"),
 }

@@ -38,6 +38,13 @@ def curve(setting: Setting, size: float) -> Fields:
     return bent, None if v is None else v * (1 + 2 * size * u)
 
 
+def drift(setting: Setting, size: float) -> Fields:
+    """Move the zero of one sensor of u steadily, by the size over the record."""
+    u, v = setting.run()
+    along = (setting.times - setting.times[0]) / (setting.times[-1] - setting.times[0])
+    return u + size * along[:, None] * setting.one, v
+
+
 def slow_clock(setting: Setting, size: float) -> Fields:
     """Read each row late by a share of the time since the first."""
     begin = setting.times[0]

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 # Effects of which one may be found at several sensors.
 ONE_FOR_ALL = ("sensor-offset", "sensor-gain")
+# What an instrument of a kind does by itself: a finding says so, or the noise model holds it.
+OF_INSTRUMENT = {"drifting-zero": "sensor-drift"}
 # The power of the unit of u by which the parameters of effects grow, where it is not 0.
 POWERS = {
     "onsite-quadratic": -1, "onsite-cubic": -2, "onsite-quintic": -4, "nonlinear-coupling": -2, "quadratic-drag": -1,
@@ -150,13 +152,15 @@ class Judgement:
     covered: tuple[int, int]
 
 
-def judge(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding]) -> Judgement:
+def judge(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], instrument: str = "") -> Judgement:
     """Return how well findings agree with what is in a recording.
 
     Args:
         truth: effects, as `written` gives them.
         found: by the diagnosis.
+        instrument: its kind; what that does by itself is not invented, and need not be found.
     """
+    found = [one for one in found if one.name != OF_INSTRUMENT.get(instrument)]
     pairs = matched(truth, found)
     named = tuple(one["name"] for one, j in zip(truth, pairs, strict=True) if j is not None)
     missed = tuple(one["name"] for one, j in zip(truth, pairs, strict=True) if j is None)

@@ -58,6 +58,13 @@ def test_each_effect_needs_a_finding_of_its_own() -> None:
     assert judge(truth, [said("dry-friction", None, ("damping",)), said("dry-friction")]).right
 
 
+def test_what_an_instrument_does_by_itself_is_neither_missed_nor_invented() -> None:
+    assert judge([], [said("sensor-drift", 0)], "drifting-zero").right
+    assert judge([], [], "drifting-zero").right
+    assert judge([], [said("sensor-drift", 0)], "white").invented == ("sensor-drift",)
+    assert judge([], [said("sensor-offset", 0)], "drifting-zero").invented == ("sensor-offset",)
+
+
 def test_offsets_of_several_sensors_are_one_effect_with_all_their_sizes() -> None:
     truth = [there("sensor-offset", None, offset_1=1.0, offset_2=-2.0)]
     found = [said("sensor-offset", 0, offset_1=(1.1, 0.1)), said("sensor-offset", 1, offset_2=(-2.3, 0.1))]

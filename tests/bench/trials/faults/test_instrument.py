@@ -53,6 +53,14 @@ def lied(name, effect, **options):
 
 
 @pytest.mark.parametrize("name", BOTH)
+def test_the_zero_of_one_sensor_drifts_steadily(name):
+    shown, true, one = lied(name, "sensor-drift")
+    site, t = int(one.about["site"]), one.clean.t
+    steady = np.real(one.amount) * (t - t[0]) / (t[-1] - t[0])
+    np.testing.assert_allclose(shown - true, steady[:, None] * (np.arange(true.shape[1]) == site), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", BOTH)
 def test_a_drifting_sensor_warms_up(name):
     shown, true, one = lied(name, "other: drifting-sensor")
     site, t = int(one.about["site"]), one.clean.t
