@@ -13,7 +13,7 @@ import pandas as pd
 from latticebench.bench.provenance import describe
 from latticebench.bench.published import folder_of, read_head
 from latticebench.bench.store import is_store, open_store
-from latticebench.bench.tables import ABOUT, SHOWN, read_cases, takes_truth
+from latticebench.bench.tables import ABOUT, SHOWN, file_of_cases, read_cases, takes_truth
 from latticebench.systems.errors import InputError
 
 
@@ -25,12 +25,14 @@ class Published:
         cases: their table of cases.
         about: in words, where they are from.
         commits: what made them.
+        file: that they were read from.
         mark: stands behind the names of their methods.
     """
 
     cases: pd.DataFrame
     about: str
     commits: str
+    file: Path = Path()
     mark: str = "*"
 
     def joined(self, own: pd.DataFrame) -> pd.DataFrame:
@@ -75,16 +77,16 @@ def read_published(folder: Path) -> Published:
     if not os.path.exists(folder) and folder_of(str(folder)).is_dir():
         folder = folder_of(str(folder))
     cases = read_cases(folder)
+    file = file_of_cases(folder)
     if is_store(folder):
         store = open_store(folder)
         with store.sound():
             commits = describe(store.origins(), {})["commit"]
     else:
-        path = folder / "cases.csv" if os.path.isdir(folder) else folder
-        commits = [read_head(path).get("commit", "unknown")]
+        commits = [read_head(file).get("commit", "unknown")]
     told = " and ".join(commits)
     # Where it lies on this machine is nobody's business.
-    return Published(cases, f"{'/'.join(folder.resolve().parts[-2:])}, commit {told}", told)
+    return Published(cases, f"{'/'.join(folder.resolve().parts[-2:])}, commit {told}", told, file)
 
 
 def without_method(identity: str) -> str:
@@ -93,21 +95,26 @@ def without_method(identity: str) -> str:
     Raises:
         InputError: it is no identity.
     """
-    content = _content(identity)
+    content = content_of(identity)
     return json.dumps({name: content[name] for name in content if name not in ("method", "settings")}, sort_keys=True)
 
 
 def _named(label: str, identity: str, mark: str) -> str:
     """Return what a published method is called; tables of earlier versions do not mark those that see the truth."""
     plain = label.removesuffix(SHOWN)
-    truth = plain != label or takes_truth(str(_content(identity).get("method")))
+    truth = plain != label or takes_truth(str(content_of(identity).get("method")))
     return f"{plain}{mark}{SHOWN if truth else ''}"
 
 
-def _content(identity: str) -> dict[str, Any]:
+def content_of(identity: str) -> dict[str, Any]:
+    """Return the settings that an identity is made of.
+
+    Raises:
+        InputError: it is no identity.
+    """
     try:
         found = json.loads(identity)
-    except (ValueError, RecursionError):
+    except (ValueError, TypeError, RecursionError):
         found = None
     if not isinstance(found, dict):
         raise InputError(f"{identity!r} is no identity of a case; is the table one of `latticebench table`?")

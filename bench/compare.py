@@ -38,6 +38,7 @@ NEEDED: Mapping[str, Sequence[str]] = {
     "trial": ("system", "effect", "z", "noise", "velocities", "seed", "status", "right", "residual_after"),
     "laboratory": ("asked", "seed", "status", "right", "residual_after"),
 }
+NUMBERS = ("e2", "residual", "residual_after", "z", "noise", "seed")
 COLUMNS = ("identity", "case", "method", "status", "right", "e2", "residual")
 
 
@@ -164,7 +165,7 @@ def read_run(path: Path) -> pd.DataFrame:
         raise InputError(
             f"{path}: no results; give a store of them, a folder of published tables, or one of {', '.join(TABLES)}"
         )
-    frame = read_table(path)
+    frame = read_table(path, NUMBERS)
     kind = "laboratory" if "asked" in frame else "trial" if "effect" in frame else "fit"
     form, needed = FORMS[kind], NEEDED[kind]
     missing = [name for name in needed if name not in frame]

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from latticebench.bench import source
+from latticebench.bench.beside import content_of
 from latticebench.bench.case import Case
 from latticebench.bench.published import folder_of
 from latticebench.bench.run import counts
@@ -21,12 +22,27 @@ from latticebench.bench.suite import Suite
 from latticebench.bench.tables import read_cases
 from latticebench.systems.errors import InputError
 
+# Nothing that ran took longer: thirty years.
+LONGEST = 1e9
+
 
 class Time(NamedTuple):
     """What a case took: seconds of wall time and of processor time, for the fit or the diagnosis alone."""
 
     seconds: float
     cpu: float
+
+    @classmethod
+    def read(cls, seconds: float | str | None, cpu: float | str | None) -> Time:
+        """Return times that were written down.
+
+        Raises:
+            ValueError, TypeError: these are none.
+        """
+        found = cls(float(seconds or 0), float(cpu or 0))
+        if not all(0 <= one <= LONGEST for one in found):
+            raise ValueError(f"a time of {max(found):g} seconds")
+        return found
 
 
 @dataclass(frozen=True)
@@ -112,7 +128,7 @@ def _recorded(name: str, store: Store | None) -> tuple[dict[str, Time], tuple[st
     for place, times in readings:
         fresh: dict[str, list[Time]] = {}
         for identity, took in times:
-            fresh.setdefault(_seedless(identity), []).append(took)
+            fresh.setdefault(identity, []).append(took)
         if fresh:
             sources.append(place)
         # This machine knows better than a published table.
@@ -125,25 +141,25 @@ def _of_store(store: Store) -> Iterator[tuple[str, Time]]:
     with store.sound():
         for identity, status, case, content in store.read('SELECT identity, status, "case", content FROM results'):
             if status == "timeout":
-                limit = float(json.loads(case)["time_limit"])
-                yield identity, Time(limit, limit)
+                limit = json.loads(case)["time_limit"]
+                yield _seedless(identity), Time.read(limit, limit)
                 continue
             took: Mapping[str, float | None] = json.loads(content)
             if took.get("seconds") is not None and took.get("cpu_seconds") is not None:
-                yield identity, Time(float(took["seconds"] or 0), float(took["cpu_seconds"] or 0))
+                yield _seedless(identity), Time.read(took["seconds"], took["cpu_seconds"])
 
 
 def _of_table(folder: Path) -> Iterator[tuple[str, Time]]:
     try:
         table = read_cases(folder)
-    except InputError:
+        times = table[["identity", "seconds", "cpu_seconds"]].dropna()
+        yield from [(_seedless(identity), Time.read(*took)) for identity, *took in times.itertuples(index=False)]
+    except (InputError, KeyError, ValueError):
+        # What was published there is no table of this kind; there is nothing to be told from it.
         return
-    for identity, seconds, cpu in table[["identity", "seconds", "cpu_seconds"]].dropna().itertuples(index=False):
-        yield str(identity), Time(float(seconds), float(cpu))
 
 
 def _seedless(identity: str) -> str:
     """Return an identity without its seed."""
-    content = json.loads(identity)
-    content.pop("seed", None)
-    return json.dumps(content, sort_keys=True)
+    content = content_of(identity)
+    return json.dumps({name: content[name] for name in content if name != "seed"}, sort_keys=True)

@@ -48,7 +48,7 @@ class Leases:
         """
         with self.store.writing(durable=False) as cursor:
             held = cursor.execute("SELECT owner, until FROM leases WHERE key = ?", (key,)).fetchone()
-            if held is not None and held[0] != self.owner and held[1] > time.time() and not _gone(held[0]):
+            if held is not None and held[0] != self.owner and _lasts(held[1]) and not _gone(held[0]):
                 return False
             cursor.execute("INSERT OR REPLACE INTO leases VALUES (?, ?, ?)", (key, self.owner, time.time() + LASTS))
         return True
@@ -66,6 +66,11 @@ class Leases:
             cursor.execute("DELETE FROM leases WHERE key LIKE ? AND owner = ?", (key, self.owner))
 
 
+def _lasts(until: object) -> bool:
+    """Return whether a lease holds: one from far ahead, of a clock that is wrong or a damaged store, does not."""
+    return isinstance(until, (int, float)) and 0 < until - time.time() < 2 * LASTS
+
+
 def _gone(owner: str) -> bool:
     """Return whether the process of an owner has ended, as far as one can know: that of another machine has not."""
     node, _, rest = str(owner).rpartition(" ")[0].partition(" ")
@@ -74,7 +79,7 @@ def _gone(owner: str) -> bool:
         return False
     try:
         return f"{psutil.Process(int(number)).create_time():.2f}" != started
-    except (psutil.NoSuchProcess, ValueError):
+    except (psutil.NoSuchProcess, ValueError, OverflowError):
         return True
     except psutil.Error:
         return False

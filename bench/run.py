@@ -157,4 +157,8 @@ def counts(case: Case, status: str, text: str, retry: bool) -> bool:
     if status not in ("timeout", "memory"):
         return not (retry and status in ("failed", "died"))
     limit = "time_limit" if status == "timeout" else "memory_limit"
-    return not retry and bool(getattr(case, limit) <= json.loads(text)[limit])
+    try:
+        return not retry and bool(getattr(case, limit) <= json.loads(text)[limit])
+    except (ValueError, TypeError, LookupError, RecursionError):
+        # The store is damaged: the case is run again.
+        return False

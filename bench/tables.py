@@ -14,7 +14,7 @@ import pandas as pd
 from latticebench import methods
 from latticebench.bench.fitting import described
 from latticebench.bench.published import read_table
-from latticebench.bench.store import is_store, open_store
+from latticebench.bench.store import FILE, is_store, open_store
 from latticebench.systems.errors import InputError
 
 SCORES = (
@@ -196,6 +196,13 @@ def _efficiency(group: pd.DataFrame) -> float:
     return float(np.sqrt(np.mean(bound**2) / np.mean(e2**2)))
 
 
+def file_of_cases(path: Path) -> Path:
+    """Return the file that a table of cases is read from: of a store, a folder, or the table itself."""
+    if is_store(path):
+        return path / FILE
+    return path / "cases.csv" if os.path.isdir(path) else path
+
+
 def read_cases(path: Path) -> pd.DataFrame:
     """Read a published table of cases, or make it from a store.
 
@@ -206,16 +213,13 @@ def read_cases(path: Path) -> pd.DataFrame:
         store = open_store(path)
         with store.sound():
             return cases(store.results(kind="fit"))
-    path = path / "cases.csv" if os.path.isdir(path) else path
+    path = file_of_cases(path)
     if not os.path.isfile(path):
         raise InputError(f"{path}: no such table; give a store of results, a folder with cases.csv, or a cases.csv")
-    table = read_table(path)
+    table = read_table(path, (*SCORES, "covered", "noise", "seed"))
     missing = [name for name in ("identity", "status", "e2") if name not in table]
     if missing:
         raise InputError(f"{path}: not a table of cases: the column {missing[0]!r} is missing")
-    for name in (*SCORES, "covered", "noise", "seed"):
-        if name in table:
-            table[name] = pd.to_numeric(table[name], errors="coerce")
     return table
 
 

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 PAPER_STEP = 1e-3
 MAX_VALUES = 50_000_000
+# Evaluations that nobody would wait for, and after how many one looks whether it will come to them.
+HOPELESS, TRIED = 10**9, 10**5
 
 
 def sample_times(
@@ -105,7 +107,11 @@ class _Exhausted(Exception):
 def _adaptive(
     chain: Motion, start: ndarray, times: ndarray, options: dict[str, Any], most_evaluations: int | None = None
 ) -> tuple[ndarray, int]:
-    """Return the finite and bounded states that `solve_ivp` finds, at least the first, and their number."""
+    """Return the finite and bounded states that `solve_ivp` finds, at least the first, and their number.
+
+    Raises:
+        InputError: without `most_evaluations`, the motion is so fast that it would take hopelessly many.
+    """
     from scipy.integrate import solve_ivp
 
     limit = 1e6 * (1 + float(np.max(np.abs(start))))
@@ -118,7 +124,11 @@ def _adaptive(
     def counted(t: float, y: ndarray) -> ndarray:
         nonlocal count
         count += 1
-        if most_evaluations is not None and count > most_evaluations:
+        if most_evaluations is not None:
+            exhausted = count > most_evaluations
+        else:
+            exhausted = count % TRIED == 0 and count * (times[-1] - times[0]) > HOPELESS * (t - times[0])
+        if exhausted:
             raise _Exhausted
         return rate(t, y)
 
@@ -127,10 +137,17 @@ def _adaptive(
         warnings.simplefilter("ignore")
         try:
             found = solve_ivp(counted, (times[0], times[-1]), start, t_eval=times, events=escaped, **options)
-        except (_Exhausted, FloatingPointError, RuntimeError, ValueError, np.linalg.LinAlgError):
+        except _Exhausted:
+            if most_evaluations is None:
+                raise InputError(
+                    f"the motion is too fast: to t = {times[-1]:g} it would take more than {HOPELESS:g} evaluations; "
+                    "take a shorter span, or slower terms"
+                ) from None
             return np.asarray(start)[:, None], 1
-    finite = np.all(np.isfinite(found.y), axis=0) if len(found.t) else np.zeros(0, dtype=bool)
-    reached = int(np.argmin(finite)) if not np.all(finite) else found.y.shape[1]
+        except (FloatingPointError, RuntimeError, ValueError, np.linalg.LinAlgError):
+            return np.asarray(start)[:, None], 1
+    finite = np.all(np.isfinite(found.y), axis=0) if len(found.t) else np.zeros(1, dtype=bool)
+    reached = len(finite) if np.all(finite) else int(np.argmin(finite))
     if reached == 0:
         return np.asarray(start)[:, None], 1
     return np.asarray(found.y[:, :reached]), reached

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from latticebench.bench.cli.options import Beside, place
+from latticebench.bench.cli.options import Beside, check_places, place
 from latticebench.systems.errors import InputError, printable, unknown
+from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
     from latticebench.bench.against import Contest
@@ -93,29 +94,33 @@ def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path |
     from latticebench.bench.beside import read_published
     from latticebench.bench.figures import IMAGES
     from latticebench.bench.provenance import command_line, commit
-    from latticebench.bench.tables import read_cases
+    from latticebench.bench.tables import file_of_cases, read_cases
 
     if out is not None and out.suffix.lower() not in (*IMAGES, *TABLES, ""):
         raise unknown("ending", out.suffix, (*IMAGES, *TABLES), f"--out {out}")
     table = read_cases(run)
     about = {"command": command_line(), "commit": commit()}
+    read = [file_of_cases(run)]
     if beside is not None:
         published = read_published(beside)
         table = published.joined(table)
         about["published"] = published.about
+        read.append(published.file)
     found = against(table, reference)
+    files = () if out is None else _files(found, out)
+    for path in files:
+        check_places(read, out=path)
     _show(found)
-    if out is not None:
-        for path in _write(found, out, about):
-            print(path)
+    for path in files:
+        print(shown(_write(found, path, about)))
 
 
 def _show(found: Contest) -> None:
     from latticebench.bench.publish import readable
     from latticebench.bench.report.screen import show_note, show_rows
 
-    shown = readable(found.methods)
-    show_rows(list(shown.columns), shown.to_numpy().tolist())
+    rows = readable(found.methods)
+    show_rows(list(rows.columns), rows.to_numpy().tolist())
     show_note("per case: E2 smaller, larger, not told apart; ratio of E2, median over the cases with its 95 % interval")
     if found.ranks is None:
         show_note("no mean ranks: they need three methods and two cases that all of them have")
@@ -129,26 +134,34 @@ def _show(found: Contest) -> None:
     )
 
 
-def _write(found: Contest, out: Path, about: dict[str, Any]) -> list[Path]:
-    """Write mean ranks into a figure, wins and losses into a table, or all that there is into a folder.
+def _files(found: Contest, out: Path) -> list[Path]:
+    """Return what is written: mean ranks as a figure, wins and losses as a table, or into a folder all that there is.
 
     Raises:
-        InputError: there are no mean ranks for the figure, or a file cannot be written.
+        InputError: there are no mean ranks for the figure.
+    """
+    if found.ranks is None and out.suffix.lower() not in (*TABLES, ""):
+        raise InputError(f"--out {shown(out)}: there are no mean ranks to draw; they need three methods and two cases")
+    if out.suffix:
+        return [out]
+    tables = [out / f"{name}{form}" for name in ("against", "against-cases") for form in TABLES]
+    return tables if found.ranks is None else [*tables, out / "ranks.png"]
+
+
+def _write(found: Contest, path: Path, about: dict[str, Any]) -> Path:
+    """Write mean ranks into a figure, or wins and losses into a table.
+
+    Raises:
+        InputError: the file cannot be written.
     """
     from latticebench.bench.figures import save
     from latticebench.bench.publish import render
     from latticebench.bench.ranking import draw_ranks
     from latticebench.systems.files import write_text
 
-    files = [out] if out.suffix else [out / f"{name}{form}" for name in ("against", "against-cases") for form in TABLES]
-    if not out.suffix and found.ranks is not None:
-        files.append(out / "ranks.png")
-    for path in files:
-        if path.suffix.lower() in TABLES:
-            frame = found.cases if path.stem == "against-cases" else found.methods
-            write_text(path, render(frame, about, path.suffix.lower()[1:], path.stem))
-        elif found.ranks is None:
-            raise InputError(f"--out {path}: there are no mean ranks to draw; they need three methods and two cases")
-        else:
-            save(draw_ranks(found.ranks), path, about)
-    return files
+    if path.suffix.lower() not in TABLES:
+        assert found.ranks is not None
+        return save(draw_ranks(found.ranks), path, about)
+    frame = found.cases if path.stem == "against-cases" else found.methods
+    write_text(path, render(frame, about, path.suffix.lower()[1:], path.stem))
+    return path

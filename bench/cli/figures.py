@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.options import Beside, place
+from latticebench.bench.cli.options import Beside, check_places, place
 from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.files import check_outputs, shown, whole
 
 if TYPE_CHECKING:
     from latticebench.bench.beside import Published
@@ -47,8 +48,10 @@ def figures(
     if out is not None and out.suffix.lower() in ENDINGS:
         _draw_one(store, out, only, published)
         return
-    for path in kinds.draw(store, folder / "figures" if out is None else out, only, published):
-        print(path)
+    drawn = folder / "figures" if out is None else out
+    check_places([], out=drawn / "figure.png")
+    for path in kinds.draw(store, drawn, only, published):
+        print(shown(path))
 
 
 def _draw_one(store: Store, out: Path, only: list[str] | None, beside: Published | None) -> None:
@@ -59,7 +62,6 @@ def _draw_one(store: Store, out: Path, only: list[str] | None, beside: Published
     """
     from latticebench.bench import kinds
     from latticebench.bench.figures import IMAGES, drawn_as
-    from latticebench.systems.files import check_outputs, shown, whole
 
     if out.suffix.lower() not in IMAGES:
         raise unknown("ending", out.suffix, IMAGES, f"--out {shown(out)}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.options import Beside, place
+from latticebench.bench.cli.options import Beside, check_places, place
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import shown
 
@@ -45,6 +45,9 @@ def table(
     kinds.check_tables(only)
     store = open_store(folder)
     published = None if beside is None else read_published(beside)
+    # Results of several kinds have folders of their own.
+    for part in (Path(), Path("fit")) if out is not None else ():
+        check_places([published and published.file], out=out / part / "cases.csv")
     if as_json:
         if published is not None:
             raise InputError("--json: it has the run alone; leave --with out, or take the CSV files of --out")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import itertools
 import math
 import os
 import struct
@@ -14,7 +11,7 @@ from pathlib import Path
 
 import pydantic
 
-from latticebench.bench.escape import csv_text
+from latticebench.bench.published import read_rows
 from latticebench.bench.report.content import DiagnosisDocument
 from latticebench.bench.store import is_store
 from latticebench.systems.errors import InputError, printable
@@ -151,26 +148,10 @@ def read_table(path: Path) -> Table:
     Raises:
         InputError: it is none, or cells are missing; the message names the row.
     """
-    text = read_text(path, DATA).splitlines(keepends=True)
-    head = list(itertools.takewhile(lambda line: line.startswith("#"), text))
+    head, columns, rows = read_rows(path)
     parts = (line.removeprefix("#").strip().partition(": ") for line in head)
     about = tuple((name, value) if value else ("note", name) for name, _, value in parts)
-    try:
-        # Later sharp signs are part of a cell.
-        rows = [tuple(map(csv_text, row)) for row in csv.reader(io.StringIO("".join(text[len(head) :])), strict=True)]
-    except csv.Error as error:
-        raise InputError(f"{shown(path)}: not a table: {error}") from None
-    if not rows or not all(rows[0]):
-        raise InputError(f"{shown(path)}: not a table: the names of its columns are missing")
-    columns = rows[0]
-    if twice := [name for name in columns if columns.count(name) > 1]:
-        raise InputError(f"{shown(path)}: not a table: two columns are called {printable(twice[0])!r}")
-    for number, row in enumerate(rows[1:], 1):
-        if len(row) != len(columns):
-            raise InputError(
-                f"{shown(path)}: row {number}: {len(row)} cells under {len(columns)} columns; publish the table again"
-            )
-    return Table(columns, tuple(rows[1:]), about)
+    return Table(tuple(columns), tuple(map(tuple, rows)), about)
 
 
 def read_diagnosis(path: Path) -> DiagnosisDocument | None:

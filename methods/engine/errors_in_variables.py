@@ -84,6 +84,8 @@ def estimate(
         return _iterate(forms, support, rounds, np.where(support, start.coefficients, 0.0), start.states)
     seen = tuple(form.state.seen for form in forms)
     rows = np.concatenate([_joined(form, form.state.seen) for form in forms])
+    if not np.all(np.isfinite(rows)):
+        raise InputError(f"{forms[0].samples.source}: the weak form fails: a term is not finite on the data")
     found = _iterate(forms, support, rounds, Regression(rows[:, :-1], rows[:, -1]).least_squares(support), seen)
     if found.settled and found.chi2 < SUSPECT:
         return found

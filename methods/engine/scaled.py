@@ -79,7 +79,13 @@ def lstsq(
     """Return the solution of smallest norm in units of `scale`; of each column's root mean square if that is None.
 
     Directions whose singular value is below `rcond` of the largest stay at 0.
+
+    Raises:
+        numpy.linalg.LinAlgError: a number is not finite.
     """
+    # LAPACK would say so itself, on the screen.
+    if not (np.all(np.isfinite(design)) and np.all(np.isfinite(target))):
+        raise np.linalg.LinAlgError("the least squares are of numbers that are not finite")
     if scale is None:
         scale = np.sqrt(np.mean(design**2, axis=0))
         scale[scale == 0] = 1.0

@@ -89,7 +89,11 @@ def _bridged(t: ndarray, value: ndarray, slope: ndarray, known: ndarray) -> tupl
 
 
 def guess(data: Sequence[Samples], records: Sequence[Record]) -> State:
-    """Return smoothed states, with the coefficients that best carry each of them to the next."""
+    """Return smoothed states, with the coefficients that best carry each of them to the next.
+
+    Raises:
+        InputError: a term is not finite along the smoothed states.
+    """
     nodes: list[ndarray] = []
     splines: list[ndarray | None] = []
     for samples, record in zip(data, records, strict=True):
@@ -97,10 +101,10 @@ def guess(data: Sequence[Samples], records: Sequence[Record]) -> State:
         nodes.append(dynamics.pack(*smooth(samples, dynamics.order)))
         splines.append(None if drive is None else fit_border(drive, samples, dynamics))
     state = State(np.zeros(len(records[0].stretches.dynamics.terms)), tuple(nodes), tuple(splines))
-    return replace(state, coefficients=_carrying(records, state))
+    return replace(state, coefficients=_carrying(data, records, state))
 
 
-def _carrying(records: Sequence[Record], state: State) -> Float[ndarray, " terms"]:
+def _carrying(data: Sequence[Samples], records: Sequence[Record], state: State) -> Float[ndarray, " terms"]:
     """Return the coefficients by least squares on the integrals of the terms along the states.
 
     v(t_l) - v(t_k) = sum_j xi_j * (integral of T_j from t_k to t_l), likewise for u at order 1; integrals suffer less
@@ -109,12 +113,14 @@ def _carrying(records: Sequence[Record], state: State) -> Float[ndarray, " terms
     from scipy.interpolate import make_interp_spline
 
     designs, targets = [], []
-    for record, nodes, splines in zip(records, state.nodes, state.splines, strict=True):
+    for samples, record, nodes, splines in zip(data, records, state.nodes, state.splines, strict=True):
         stretches = record.stretches
         dynamics = stretches.dynamics
         f = None if stretches.inputs is None else stretches.inputs(record.times)
         driven = stretches.driven(record.times, splines)
         values = dynamics.linear(state.coefficients, record.times, nodes, f, driven, derivatives=False)[1]
+        for j in np.flatnonzero(~np.isfinite(values).all(axis=(0, 2, 3))):
+            raise InputError(f"{samples.source}: the term {dynamics.terms[j]} is not finite there; leave it out")
         curve = make_interp_spline(record.times, np.moveaxis(values, 2, 0), k=min(3, len(record.times) - 1))
         total = curve.antiderivative()(record.times)
         rate = nodes.reshape(len(nodes), dynamics.order, dynamics.parts, dynamics.count)[:, -1]

@@ -152,6 +152,17 @@ def test_the_papers_integrator_and_the_reference_give_the_same_samples(name):
     np.testing.assert_allclose(usual.u, reference.u, atol=1e-11 if system.integrator == "rk4" else 1e-6)
 
 
+@pytest.mark.parametrize("method", ["bdf", "dop853"])
+def test_a_motion_that_would_take_hopelessly_many_evaluations_is_told_soon(method):
+    with pytest.raises(InputError, match="too fast"):
+        simulate(own("-1e12*sin(1e12*u[n])"), integrator=method)
+
+
+def test_a_force_that_is_not_finite_is_told():
+    with pytest.raises(InputError, match="grows without bound"):
+        simulate(own("exp(1e9)"))
+
+
 @pytest.mark.parametrize("method", ["rk4", "bdf", "dop853"])
 def test_a_state_that_grows_without_bound_is_told(method):
     with pytest.raises(InputError, match="without bound"):
