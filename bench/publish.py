@@ -16,6 +16,7 @@ from latticebench.bench.latex import latex
 from latticebench.bench.paired import paired
 from latticebench.bench.provenance import lines
 from latticebench.bench.tables import ABOUT, shown_truth, summary, tables
+from latticebench.systems.errors import printable
 from latticebench.systems.files import write_text
 
 FORMATS = ("csv", "md", "tex")
@@ -164,7 +165,9 @@ def markdown_table(frame: pd.DataFrame) -> str:
     quoted = readable(frame).map(lambda value: markdown(str(value)))
     if "term" in quoted:
         # What stands between backticks is shown as it is, but for the end of a cell.
-        quoted["term"] = ["`" + str(term).replace("|", "\\|") + "`" for term in frame["term"]]
+        quoted["term"] = [
+            "`" + printable(str(term)).replace("|", "\\|").replace("`", "'") + "`" for term in frame["term"]
+        ]
     quoted.columns = pd.Index([markdown(str(name)) for name in quoted.columns])
     return str(quoted.to_markdown(index=False, disable_numparse=True))
 

@@ -52,6 +52,7 @@ def take(
 ) -> None:
     """Check that a file is a recording, by its SHA-256, and copy it to where you want it. Nothing is downloaded."""
     from latticebench.bench.recordings import take as copy
+    from latticebench.systems.files import shown
 
     made, new = copy(name, origin, place)
-    print(f"{made}: {'copied' if new else 'was there already'}, SHA-256 as it should be")
+    print(f"{shown(made)}: {'copied' if new else 'was there already'}, SHA-256 as it should be")

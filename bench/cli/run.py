@@ -14,7 +14,8 @@ import typer
 
 from latticebench.bench.cli.options import Jobs, Methods, Only, Recordings, Seeds, Yes, complete_suites, place
 from latticebench.bench.cli.table import document
-from latticebench.systems.errors import InputError
+from latticebench.systems.errors import InputError, printable
+from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
     from latticebench.bench.case import Case
@@ -76,7 +77,7 @@ def run(
             _, tally = run_suite(loaded, store, jobs=jobs, retry=retry, shard=part, watcher=watcher, about=about)
     except KeyboardInterrupt:
         print(
-            f"stopped; {len(store.results())} results are in {folder}; the same command continues from there",
+            f"stopped; {len(store.results())} results are in {shown(folder)}; the same command continues from there",
             file=sys.stderr,
         )
         raise
@@ -86,7 +87,7 @@ def run(
     if as_json:
         print(document(store, part), end="")
     else:
-        _show(store, title, part, f"{tally.ran} run now, {tally.reused} were there; kept in {folder}")
+        _show(store, title, part, f"{tally.ran} run now, {tally.reused} were there; kept in {shown(folder)}")
 
 
 def _show(store: Store, title: str, part: Shard, told: str) -> None:
@@ -95,7 +96,8 @@ def _show(store: Store, title: str, part: Shard, told: str) -> None:
 
     kinds.show(store, title, shard=part)
     statuses = store.statuses(part)
-    print(f"{sum(statuses.values())} cases ({', '.join(f'{n} {status}' for status, n in statuses.items())}); {told}")
+    counts = printable(", ".join(f"{n} {status}" for status, n in statuses.items()))
+    print(f"{sum(statuses.values())} cases ({counts}); {told}")
 
 
 def _tell_estimate(suite: Suite, part: Shard, jobs: int, folder: Path, retry: bool, as_json: bool) -> None:
@@ -119,11 +121,11 @@ def _tell_estimate(suite: Suite, part: Shard, jobs: int, folder: Path, retry: bo
     ]
     show_rows(("method", "cases", "finished", "with a recorded time", "which is"), rows)
     to_run = found.cases - found.there
-    print(f"{found.cases} cases, {found.there} of them finished in {folder}; {to_run} to run")
+    print(f"{found.cases} cases, {found.there} of them finished in {shown(folder)}; {to_run} to run")
     if found.known:
         print(
             f"about {clock(found.seconds(jobs))} on {jobs} worker{'s' if jobs > 1 else ''}, {found.core_hours:.2g} "
-            f"core-hours, by what {found.known} of the {to_run} took in {' and '.join(found.sources)}"
+            f"core-hours, by what {found.known} of the {to_run} took in {' and '.join(map(shown, found.sources))}"
         )
     if found.known < to_run:
         print(
@@ -145,7 +147,7 @@ def _tell_hours(suite: str, cases: Sequence[Case], jobs: int, yes: bool) -> None
     if not yes:
         check_hours(most, suite)
     if most > TOLD_HOURS:
-        print(f"{suite}: at most {most:.0f} hours, if every case needs all of its time limit", file=sys.stderr)
+        print(f"{shown(suite)}: at most {most:.0f} hours, if every case needs all of its time limit", file=sys.stderr)
 
 
 def shard_of(text: str | None, cases: int) -> Shard:

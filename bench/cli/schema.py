@@ -36,9 +36,9 @@ def schema(
 def _write(folder: Path, name: str | None) -> None:
     """Write the schemas that documents have in this version, or one of them."""
     from latticebench.bench.report.schema import DOCUMENTS, json_schema
-    from latticebench.systems.files import write_text
+    from latticebench.systems.files import shown, write_text
 
     for kind in DOCUMENTS if name is None else [name]:
         path = folder / f"{kind}.json"
         write_text(path, json_schema(kind))
-        print(path)
+        print(shown(path))

@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 
 from latticebench.bench.case import NAME
+from latticebench.bench.escape import markdown
 from latticebench.bench.provenance import lines
 from latticebench.bench.publish import format_number, markdown_list, readable
 from latticebench.systems.errors import InputError
@@ -62,7 +63,9 @@ def publish(
         if not re.fullmatch(NAME, str(result["case"]["name"])):
             raise InputError(f"{folder}: a recording called {result['case']['name']!r} can have no file of that name")
     head = markdown_list(lines(about))
-    text = ["# Measured recordings", "", *head, "", *(line for result in ordered for line in _recording(result))]
+    text = ["# Measured recordings", "", *head, ""]
+    for result in ordered:
+        text += page_of(result)
     path = folder / "measured.md"
     write_text(path, "\n".join(text))
     written = [path]
@@ -101,8 +104,12 @@ def show(results: Iterable[Mapping[str, Any]], value: str = "") -> None:  # noqa
     show_rows(list(frame.columns), readable(frame).to_numpy().tolist())
 
 
+def page_of(result: Mapping[str, Any]) -> list[str]:
+    """Return what was found in one recording as lines of Markdown, in which what a suite says is text and no markup."""
+    return [line if line.startswith("|") else markdown(line) for line in _recording(result)]
+
+
 def _recording(result: Mapping[str, Any]) -> list[str]:
-    """Write what was found in one recording, as lines of Markdown."""
     case, report = result["case"], result["report"]
     rows = f", rows {case['rows'][0]} to {case['rows'][1]}" if case["rows"] else ""
     declared = f"{case['about']} (`{case['terms']}`, order {case['order']}, ends {case['ends']})"
@@ -122,7 +129,8 @@ def _recording(result: Mapping[str, Any]) -> list[str]:
     error = report["error"]
     text += ["", "| | before | after |", "|---|---|---|"]
     for name, title in ERRORS.items():
-        text.append(f"| {title} | {format_number(error[name]['before'])} | {format_number(error[name]['after'])} |")
+        before, after = (markdown(format_number(error[name][when])) for when in ("before", "after"))
+        text.append(f"| {title} | {before} | {after} |")
     text += ["", "How the search went: the best model on each horizon, and how far the next one was behind (nats):", ""]
     for one in report["horizons"]:
         best, *others = one["models"]

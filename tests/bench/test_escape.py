@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from latticebench.bench.escape import csv_cell, csv_table, csv_text, label, markdown
-from latticebench.bench.publish import render
+from latticebench.bench.publish import markdown_table, render
+from latticebench.bench.trials.recorded import page_of
 from latticebench.systems.errors import printable
 from latticebench.systems.files import shown
 
@@ -62,3 +63,24 @@ def test_labels_of_figures_are_no_mathematics() -> None:
     assert csv_cell("-1.5e-3") == "-1.5e-3"
     assert csv_cell("-2*u[n]") == "'-2*u[n]"
     assert shown("a\nb.csv") == "a\\nb.csv"
+
+
+def test_what_a_suite_says_of_a_recording_is_text_in_its_page(tmp_path: Path) -> None:
+    evil = "<script>x</script> [a](javascript:x) `"
+    case = {"name": "one", "about": evil, "file": evil, "terms": "u[n]", "order": 2, "ends": evil, "rows": None}
+    error = {name: {"before": "<b>", "after": 0.5} for name in ("residual", "rms", "forecast")}
+    effect = {"effect": evil, "parameters": {evil: evil}, "coefficients": {}, "indistinguishable": [evil]}
+    report = {"verdict": evil, "effects": [effect], "noise_lines": [evil], "error": error, "horizons": []}
+    told = [
+        {"case": case, "status": "ok", "reason": "", "report": report, "seconds": 1.0},
+        {"case": case, "status": "failed", "reason": evil, "report": None, "seconds": None},
+    ]
+    for line in (line for one in told for line in page_of(one)):
+        assert "<script" not in line
+        assert "<b>" not in line
+        assert "](" not in line
+
+
+def test_a_term_stays_within_its_code_in_a_table() -> None:
+    table = markdown_table(pd.DataFrame({"term": ["u[n]` <script>|\x1b"], "value": [1.0]}))
+    assert r"`u[n]' <script>\|\x1b`" in table

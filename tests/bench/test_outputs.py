@@ -164,6 +164,21 @@ def test_a_result_whose_case_cannot_be_read_does_not_count() -> None:
         assert not counts(case, "timeout", text, retry=False)
 
 
+def test_a_name_of_a_folder_steers_no_terminal(made: Path, tmp_path: Path) -> None:
+    odd = "\x1b[31m"
+    shutil.copytree(made / "store", tmp_path / odd)
+    connection = sqlite3.connect(tmp_path / odd / FILE)
+    connection.execute("UPDATE results SET status = ?", (odd,))
+    connection.close()
+    for arguments in (
+        ["run", made / "s.toml", "--dry-run", "--results", odd], ["table", odd, "--out", f"{odd}2"],
+        ["schema", "fit", "--out", odd], ["run", odd], ["figures", odd],
+    ):  # fmt: skip
+        _, out, err = latticebench(tmp_path, *arguments)
+        assert out or err
+        assert "\x1b" not in out + err, arguments
+
+
 def test_a_lease_from_far_ahead_keeps_nobody_waiting(tmp_path: Path) -> None:
     store = create(tmp_path / "store")
     mine, other = Leases(store), Leases(store, owner="another machine 1 0.00 x")
