@@ -114,3 +114,12 @@ def told(data: Sequence[Samples], method: str | None, what: str) -> Iterator[Non
         raise
     except Exception as error:
         raise InputError(f"{data[0].source}: {what} failed: {type(error).__name__}: {error}") from error
+
+
+@contextmanager
+def kept(failures: list[str]) -> Iterator[None]:
+    """Keep the message of a place that fails: what was computed must not be lost to it, nor another output."""
+    try:
+        yield
+    except InputError as error:
+        failures.append(str(error))

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import asked, told
+from latticebench.bench.cli.arguments import asked, kept, told
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, check_places, complete_systems, place
 from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, layout_of, read_told
 from latticebench.systems.errors import InputError
@@ -149,13 +149,13 @@ def _report(found: Diagnosis, json_out: str | None, html_out: Path | None, *, in
     failures: list[str] = []
     # Files first: whoever reads the screen may stop reading.
     if json_out is not None and json_out != "-":
-        with _kept(failures):
+        with kept(failures):
             write_text(Path(json_out), text)
     if html_out is not None:
         from latticebench.bench.report.curves import curves
         from latticebench.bench.report.page import write_page
 
-        with _kept(failures):
+        with kept(failures):
             write_page(report, curves(found), about, html_out)
     if json_out == "-":
         print(text, end="")
@@ -163,12 +163,3 @@ def _report(found: Diagnosis, json_out: str | None, html_out: Path | None, *, in
         show(report)
     if failures:
         raise InputError("; ".join(failures))
-
-
-@contextmanager
-def _kept(failures: list[str]) -> Iterator[None]:
-    """Keep the message of a place that fails: hours of work must not be lost to it."""
-    try:
-        yield
-    except InputError as error:
-        failures.append(str(error))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import asked, pairs, told
+from latticebench.bench.cli.arguments import asked, kept, pairs, told
 from latticebench.bench.cli.options import (
     AnyEnds,
     JsonOut,
@@ -25,6 +25,7 @@ from latticebench.bench.cli.options import (
     place,
 )
 from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, layout_of, read_told
+from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
     from latticebench.bench.adequacy import Adequacy
@@ -105,7 +106,11 @@ def fit(
 def _report(
     found: Fit, data: list[Samples], quality: Adequacy, seed: int, json_out: str | None, html_out: Path | None
 ) -> None:
-    """Show a fit and how well its equation fits, and write it as JSON and as a page, each where it is asked for."""
+    """Show a fit and how well its equation fits, and write it as JSON and as a page, each where it is asked for.
+
+    Raises:
+        InputError: a file cannot be written; the other is, and the screen has it.
+    """
     from latticebench.bench.overlay import of_fit
     from latticebench.bench.report.document import provenance, to_json
     from latticebench.bench.report.fit_page import write_fit_page
@@ -120,11 +125,16 @@ def _report(
     if json_out is None and html_out is None:
         return
     overlay, about = of_fit(data, found), provenance([seed])
+    failures: list[str] = []
     if json_out is not None:
         text = to_json(fit_document(found, quality, units, about, overlay))
         if json_out == "-":
             print(text, end="")
         else:
-            write_text(Path(json_out), text)
+            with kept(failures):
+                write_text(Path(json_out), text)
     if html_out is not None:
-        write_fit_page(found, overlay, about, html_out)
+        with kept(failures):
+            write_fit_page(found, overlay, about, html_out)
+    if failures:
+        raise InputError("; ".join(failures))

@@ -41,8 +41,9 @@ def inspect(
 
     With --terms or --system it is also told whether the readings make sense in an equation with them.
     """
+    from latticebench.bench.cli.arguments import kept
     from latticebench.bench.inspection import inspect as look
-    from latticebench.systems.errors import unknown
+    from latticebench.systems.errors import InputError, unknown
     from latticebench.systems.files import write_text
     from latticebench.systems.readers import read_all
 
@@ -52,6 +53,7 @@ def inspect(
     declared = _terms(system, terms)
     data = read_all(files, "unknown", layout_of(time, columns, scale, sort))
     found = [look(one, declared) for one in data]
+    failures: list[str] = []
     if json_out is not None:
         from latticebench.bench.report.document import provenance, to_json
         from latticebench.bench.report.outputs import inspection_document
@@ -59,14 +61,18 @@ def inspect(
 
         text = to_json(inspection_document(found, units_of(data[0].origin), provenance()))
         if json_out != "-":
-            write_text(Path(json_out), text)
+            with kept(failures):
+                write_text(Path(json_out), text)
     if out is not None:
-        _draw(data[0], out)
+        with kept(failures):
+            _draw(data[0], out)
     if json_out == "-":
         print(text, end="")
     else:
         for one, samples in zip(found, data, strict=True):
             _show(one, samples)
+    if failures:
+        raise InputError("; ".join(failures))
 
 
 def _terms(system: str | None, terms: str | None) -> Library | None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from latticebench.bench.cli.arguments import kept
 from latticebench.bench.cli.options import check_places, place
 from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, layout_of, read_told
 from latticebench.systems.errors import InputError, unknown
@@ -63,11 +64,16 @@ def plot(
         if name not in panels(overlay):
             raise unknown("panel", name, panels(overlay), "--only")
     about: dict[str, Any] = {"command": command_line(), **origin()}
+    failures: list[str] = []
     if out is not None:
-        print(shown(save(draw(overlay, only or ()), out, about)))
+        with kept(failures):
+            print(shown(save(draw(overlay, only or ()), out, about)))
     if animate is not None:
-        write_film(overlay, animate, about)
-        print(shown(animate))
+        with kept(failures):
+            write_film(overlay, animate, about)
+            print(shown(animate))
+    if failures:
+        raise InputError("; ".join(failures))
 
 
 def _overlay(file: Path, trajectory: int, layout: Layout) -> Overlay:

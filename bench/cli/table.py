@@ -47,7 +47,7 @@ def table(
     published = None if beside is None else read_published(beside)
     # Results of several kinds have folders of their own.
     for part in (Path(), Path("fit")) if out is not None else ():
-        check_places([published and published.file], out=out / part / "cases.csv")
+        check_places([None if published is None else published.file], out=out / part / "cases.csv")
     if as_json:
         if published is not None:
             raise InputError("--json: it has the run alone; leave --with out, or take the CSV files of --out")

@@ -14,6 +14,8 @@ from unittest import mock
 import pytest
 
 from latticebench.bench.cli import main
+from latticebench.systems.errors import InputError
+from latticebench.systems.files import write_text
 
 # joblib remarks that it has no room for what it shares.
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
@@ -118,3 +120,32 @@ def test_an_output_on_a_full_disk_is_whole_or_not_there(name: str, made: Path) -
 @pytest.mark.parametrize("name", COMMANDS)
 def test_an_output_on_a_disk_that_is_full_at_many_points_is_whole_or_not_there(name: str, made: Path) -> None:
     survive(made, name, (0, 1, 100, 1000, 3000, 10_000, 30_000))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "left", "shown"),
+    [
+        (
+            ["fit", "t.csv", *FIT, "--method", "least-squares", "--json", "r.json", "--html", "r.html"],
+            "r.html",
+            "u'' =",
+        ),
+        (["inspect", "t.csv", "--json", "r.json", "--out", "r.svg"], "r.svg", "main frequencies"),
+    ],
+)
+def test_where_one_place_fails_the_other_output_is_written_and_the_screen_has_it(
+    arguments: list[str], left: str, shown: str, made: Path
+) -> None:
+    told = "r.json: cannot be written: the disk has failed"
+
+    def failing(path: Path, text: str) -> None:
+        if path.name == "r.json":
+            raise InputError(told)
+        write_text(path, text)
+
+    with mock.patch("latticebench.systems.files.write_text", failing):
+        code, out, err = latticebench(made, *arguments)
+    assert (code, err) == (2, f"error: {told}\n")
+    assert shown in out
+    assert (made / left).stat().st_size > 0
+    (made / left).unlink()
