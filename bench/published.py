@@ -44,7 +44,8 @@ def read_rows(path: Path) -> tuple[list[str], list[str], list[list[str]]]:
         rows = [list(map(csv_text, row)) for row in csv.reader(io.StringIO("".join(text[len(head) :])), strict=True)]
     except csv.Error as error:
         raise InputError(f"{shown(path)}: not a table: {error}") from None
-    if not rows or not all(rows[0]):
+    # One column without a name is what pandas makes of the index.
+    if not rows or not any(rows[0]):
         raise InputError(f"{shown(path)}: not a table: the names of its columns are missing")
     columns = rows.pop(0)
     if twice := [name for name in columns if columns.count(name) > 1]:
