@@ -446,6 +446,8 @@ def test_settings_that_make_no_case_are_refused_with_their_key(tmp_path: Path) -
     for text, told in (
         (head + "time_limit = inf", "grid 1: time_limit"),
         (head.replace("[[", "settings = {threshold = true}\n[["), "methods.a"),
+        (head.replace("[[", "settings = {threshold = -1}\n[["), "methods.a: method 'stlsq': setting threshold"),
+        (head.replace("stlsq", "pinn").replace("[[", "settings = {device = 'nope'}\n[["), "methods.a: method 'pinn'"),
         ('[[made]]\neffects = ["none"]\nsystems = ["phi4"]\nsites = -5', "made 1: sites"),
     ):  # fmt: skip
         (tmp_path / "s.toml").write_text(text)
