@@ -12,6 +12,7 @@ from latticebench.bench.colours import AFTER, BEFORE, FAINT, INK
 from latticebench.bench.escape import label
 from latticebench.bench.overlay import Overlay
 from latticebench.bench.provenance import lines
+from latticebench.bench.report.units import axis, with_unit
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import whole
 
@@ -69,7 +70,7 @@ def animate(overlay: Overlay, path: Path, about: Mapping[str, Any]) -> None:
     def show(row: int) -> list[Any]:
         for line, values in drawn:
             line.set_ydata(values[row])
-        axes.set_title(f"t = {overlay.t[row]:.4g}", fontsize=10, loc="left")
+        axes.set_title(label(with_unit(f"t = {overlay.t[row]:.4g}", overlay.time_unit)), fontsize=10, loc="left")
         return [line for line, _ in drawn]
 
     film = FuncAnimation(figure, show, frames=rows.tolist(), blit=False, cache_frame_data=False)
@@ -105,6 +106,6 @@ def _furnish(axes: Axes, overlay: Overlay) -> None:
     axes.axhline(0.0, color=FAINT, lw=1, zorder=0)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("site")
-    axes.set_ylabel("u")
+    axes.set_ylabel(axis("u", overlay.unit))
     if overlay.curves or overlay.is_complex:
         axes.legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)

@@ -14,7 +14,7 @@ from latticebench.methods.engine.record import prepare, without_halves
 from latticebench.methods.engine.shooting import State, maximise
 from latticebench.methods.engine.starts import guess, smooth
 from latticebench.systems.errors import InputError
-from latticebench.systems.samples import Samples
+from latticebench.systems.samples import Origin, Samples
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -45,6 +45,7 @@ class Overlay:
         noise: standard deviation of the noise of each site, in the units of u, of each part of a complex field; None
             where it is not known.
         curves: what equations make of the readings, likewise, by name; NaN where nothing is known.
+        unit, time_unit: of the readings and of the times; "" where they are not known.
     """
 
     source: str
@@ -54,6 +55,8 @@ class Overlay:
     velocity: Float[ndarray, "time parts sites"] | None = None
     noise: Float[ndarray, " sites"] | None = None
     curves: Mapping[str, Float[ndarray, "time parts sites"]] = field(default_factory=dict)
+    unit: str = ""
+    time_unit: str = ""
 
     @property
     def sites(self) -> int:
@@ -82,9 +85,24 @@ class Overlay:
         parts = [smooth(Samples(self.t, self.seen[:, k]), 2)[1] for k in range(self.seen.shape[1])]
         return np.stack([one for one in parts if one is not None], axis=1)
 
+    def read_as(self, origin: Origin) -> Overlay:
+        """Return the same in the unit of the file, where that is known; it is in that of the equation."""
+        if not origin.unit:
+            return replace(self, time_unit=origin.time)
+        size = origin.scale
+        return replace(
+            self, seen=self.seen / size, velocity=None if self.velocity is None else self.velocity / size,
+            noise=None if self.noise is None else self.noise / abs(size),
+            curves={name: one / size for name, one in self.curves.items()}, unit=origin.unit, time_unit=origin.time,
+        )  # fmt: skip
+
 
 def of_recording(samples: Samples) -> Overlay:
     """Return the readings of a recording alone."""
+    return _read(samples).read_as(samples.origin)
+
+
+def _read(samples: Samples) -> Overlay:
     v = None if samples.v is None else split_parts(samples.v, samples.is_complex)
     return Overlay(
         samples.source, len(samples.t), samples.t, split_parts(without_halves(samples).u, samples.is_complex), v
@@ -97,7 +115,7 @@ def of_fit(data: Sequence[Samples], fit: Fit) -> Overlay:
     A method that follows a motion has it. Of any other the equation is taken as it was found, and its start, with what
     comes in at unknown ends, is fitted to the readings.
     """
-    found = [_beside(one, fit, number) for number, one in enumerate(data)]
+    found = [_beside(one, fit, number).read_as(one.origin) for number, one in enumerate(data)]
 
     def left(one: Overlay) -> float:
         return float(np.nan_to_num(np.nanmean(one.residual(fit.method) ** 2), nan=np.inf))
@@ -114,7 +132,7 @@ def _beside(samples: Samples, fit: Fit, number: int) -> Overlay:
     # Not what the fit leaves: a wrong equation would be taken for noise.
     noise = of_readings(samples.t, samples.u)
     known = noise if np.all(np.isfinite(noise)) and np.all(noise > 0) else None
-    return replace(of_recording(shown), rows=len(samples.t), velocity=None, noise=known, curves={fit.method: curve})
+    return replace(_read(shown), rows=len(samples.t), velocity=None, noise=known, curves={fit.method: curve})
 
 
 def _first(samples: Samples) -> Samples:
@@ -160,10 +178,11 @@ def of_diagnosis(diagnosis: Diagnosis) -> Overlay:
     number = int(np.argmax(left))
     rows = max(FEWEST_ROWS, MOST_NUMBERS // before[number].seen[0, 0].size)
     shown = [("declared", before[number]), ("with what was found", after[number])][: 2 if diagnosis.findings else 1]
-    return Overlay(
+    found = Overlay(
         diagnosis.data[number].source, len(before[number].t), before[number].t[:rows], before[number].seen[:rows, 0],
         noise=_noise(diagnosis), curves={name: one.level[:rows, 0] for name, one in shown},
     )  # fmt: skip
+    return found.read_as(diagnosis.data[number].origin)
 
 
 def _noise(diagnosis: Diagnosis) -> Float[ndarray, " sites"]:

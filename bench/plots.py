@@ -11,6 +11,7 @@ import numpy as np
 from latticebench.bench.colours import AFTER, BEFORE, FAINT, INK, MAP, series
 from latticebench.bench.escape import label
 from latticebench.bench.overlay import Overlay
+from latticebench.bench.report.units import axis, rate_of
 from latticebench.bench.report.whereabouts import spectrum
 
 if TYPE_CHECKING:
@@ -65,11 +66,15 @@ def panels(overlay: Overlay) -> dict[str, Callable[[SubFigure, Overlay], None]]:
 
 def space_time(part: SubFigure, overlay: Overlay) -> None:
     """Draw the readings, site against time; of a complex field its modulus."""
-    _map(part.subplots(), overlay.t, overlay.seen, "|u|" if overlay.is_complex else "u", centred=False)
+    name = axis("|u|" if overlay.is_complex else "u", overlay.unit)
+    _map(part.subplots(), overlay, overlay.seen, name, centred=False)
 
 
-def _map(axes: Axes, t: ndarray, values: ndarray, name: str, *, centred: bool, limit: float | None = None) -> None:
+def _map(
+    axes: Axes, overlay: Overlay, values: ndarray, name: str, *, centred: bool, limit: float | None = None
+) -> None:
     """Draw values (T, parts, N) in space and time; of complex ones the modulus."""
+    t = overlay.t
     from matplotlib.ticker import MaxNLocator
 
     shown = values[:, 0] if values.shape[1] == 1 else np.hypot(values[:, 0], values[:, 1])
@@ -85,7 +90,7 @@ def _map(axes: Axes, t: ndarray, values: ndarray, name: str, *, centred: bool, l
     extend = "neither" if not beyond else "max" if size is None else "both"
     axes.figure.colorbar(drawn, ax=axes, label=name, extend=extend)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("t")
+    axes.set_xlabel(axis("t", overlay.time_unit))
     axes.set_ylabel("site")
 
 
@@ -104,6 +109,9 @@ def lines_of_sites(part: SubFigure, overlay: Overlay) -> None:
     near = [np.clip(one[rows, 0][:, sites], low - reach, high + reach) for one in overlay.curves.values()]
     bottom, top = _range([np.array([low, high]), *near])
     every[0].set_ylim(bottom - 0.1 * reach, top + 0.1 * reach)
+    crowded = len(sites) > 3
+    if crowded:
+        part.supylabel(axis(name, overlay.unit), fontsize=9)
     for axes, site in zip(every, sites, strict=True):
         style = {"marker": "o", "markersize": 2.2, "linestyle": "none" if overlay.curves else "-", "linewidth": 0.8}
         axes.plot(t, overlay.seen[rows, 0, site], color=INK, label="readings", **style)
@@ -111,10 +119,10 @@ def lines_of_sites(part: SubFigure, overlay: Overlay) -> None:
             values = overlay.curves[curve][rows, 0, site]
             known = np.abs(values - (low + high) / 2) < FAR * reach
             axes.plot(t, np.where(known, values, np.nan), label=label(curve), lw=1.4, **kind)
-        axes.set_ylabel(f"{name}, site {site + 1}" if len(sites) < 4 else f"site {site + 1}", fontsize=8)
+        axes.set_ylabel(f"site {site + 1}" if crowded else axis(f"{name} at site {site + 1}", overlay.unit), fontsize=8)
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.25)
-    every[-1].set_xlabel("t")
+    every[-1].set_xlabel(axis("t", overlay.time_unit))
     if overlay.curves:
         handles = every[0].get_legend_handles_labels()
         part.legend(*handles, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
@@ -148,14 +156,14 @@ def _telling(overlay: Overlay) -> tuple[list[int], slice]:
 
 def residuals(part: SubFigure, overlay: Overlay) -> None:
     """Draw what each curve leaves of the readings, on one scale: as maps, or for a few sites as lines."""
-    unit = "residual / noise" if overlay.noise is not None else "residual"
+    unit = "residual / noise" if overlay.noise is not None else axis("residual", overlay.unit)
     every = part.subplots(len(overlay.curves), 1, sharex=True, squeeze=False)[:, 0]
     left = {name: overlay.residual(name) for name in overlay.curves}
     known = np.concatenate([np.abs(one[np.isfinite(one)]) for one in left.values()])
     limit = float(np.quantile(known, 0.998)) if len(known) else 1.0
     for axes, (name, kind) in zip(every, _kinds(overlay.curves).items(), strict=True):
         if overlay.sites >= MAPPED:
-            _map(axes, overlay.t, left[name], unit, centred=True, limit=limit)
+            _map(axes, overlay, left[name], unit, centred=True, limit=limit)
         else:
             for site in range(overlay.sites):
                 values = left[name][:, 0, site]
@@ -168,7 +176,7 @@ def residuals(part: SubFigure, overlay: Overlay) -> None:
         axes.set_title(label(name), fontsize=9)
     for axes in every[:-1]:
         axes.set_xlabel("")
-    every[-1].set_xlabel("t")
+    every[-1].set_xlabel(axis("t", overlay.time_unit))
 
 
 def spectra(part: SubFigure, overlay: Overlay) -> None:
@@ -188,7 +196,7 @@ def spectra(part: SubFigure, overlay: Overlay) -> None:
         axes.set_ylabel("power of the readings")
     if len(omega):
         axes.set_yscale("log")
-    axes.set_xlabel("angular frequency")
+    axes.set_xlabel(axis("angular frequency", rate_of("rad", overlay.time_unit)))
     axes.grid(alpha=0.25)
 
 
@@ -208,5 +216,9 @@ def portraits(part: SubFigure, overlay: Overlay) -> None:
         axes.grid(alpha=0.25)
     for axes in list(every.flat)[len(sites) :]:
         axes.set_visible(False)
-    part.supxlabel("Re u" if rates is None else "u", fontsize=9)
-    part.supylabel("Im u" if rates is None else "v" if overlay.velocity is not None else "slope of u", fontsize=9)
+    part.supxlabel(axis("Re u" if rates is None else "u", overlay.unit), fontsize=9)
+    if rates is None:
+        name = axis("Im u", overlay.unit)
+    else:
+        name = axis("slope of u" if overlay.velocity is None else "v", rate_of(overlay.unit, overlay.time_unit))
+    part.supylabel(name, fontsize=9)

@@ -135,6 +135,6 @@ def _report(
                 write_text(Path(json_out), text)
     if html_out is not None:
         with kept(failures):
-            write_fit_page(found, overlay, about, html_out)
+            write_fit_page(found, overlay, quality, about, html_out)
     if failures:
         raise InputError("; ".join(failures))

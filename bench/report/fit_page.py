@@ -18,6 +18,7 @@ from latticebench.bench.report.page import environment
 from latticebench.systems.files import write_text
 
 if TYPE_CHECKING:
+    from latticebench.bench.adequacy import Adequacy
     from latticebench.methods.method import Fit
 
 CAPTIONS = {
@@ -29,22 +30,23 @@ CAPTIONS = {
 }
 
 
-def write_fit_page(found: Fit, overlay: Overlay, about: Provenance | None, path: Path) -> None:
+def write_fit_page(found: Fit, overlay: Overlay, quality: Adequacy, about: Provenance | None, path: Path) -> None:
     """Write the page of a fit, whole or not at all.
 
     Args:
         found: the fit.
         overlay: its readings and curves.
+        quality: how well the equation fits.
         about: where it comes from.
         path: the file.
 
     Raises:
         InputError: it cannot be written.
     """
-    write_text(path, fit_page(found, overlay, about))
+    write_text(path, fit_page(found, overlay, quality, about))
 
 
-def fit_page(found: Fit, overlay: Overlay, about: Provenance | None = None) -> str:
+def fit_page(found: Fit, overlay: Overlay, quality: Adequacy, about: Provenance | None = None) -> str:
     """Return the page of a fit; the arguments are those of `write_fit_page`."""
     made = environment()
     style, _, _ = made.loader.get_source(made, "diagnosis.css")  # type: ignore[union-attr]
@@ -55,7 +57,7 @@ def fit_page(found: Fit, overlay: Overlay, about: Provenance | None = None) -> s
         for text, value, error in zip(found.library.texts, found.coefficients.tolist(), errors, strict=True)
     ]
     return made.get_template("fit.html.j2").render(
-        found=found, overlay=overlay, style=style, equation=written(found), columns=columns, rows=rows,
+        found=found, overlay=overlay, quality=quality, style=style, equation=written(found), columns=columns, rows=rows,
         pictures={name: (CAPTIONS[name], _svg(overlay, name)) for name in panels(overlay)},
         origin=[] if about is None else [line.partition(": ")[::2] for line in lines(about.model_dump())],
     )  # fmt: skip

@@ -15,6 +15,7 @@ from latticebench.bench.report.content import Report
 from latticebench.bench.report.curves import PictureCurves
 from latticebench.bench.report.document import Provenance
 from latticebench.bench.report.text import INTERRUPTED
+from latticebench.bench.report.units import in_words
 from latticebench.systems.files import write_text
 
 if TYPE_CHECKING:
@@ -42,12 +43,13 @@ def page(report: Report, curves: PictureCurves, about: Provenance | None = None)
     templates = environment()
     style, _, _ = templates.loader.get_source(templates, "diagnosis.css")  # type: ignore[union-attr]
     return templates.get_template("diagnosis.html.j2").render(
-        report=report, curves=curves, style=style, pictures=pictures.draw(curves, [float(one) for one in frequencies]),
+        report=report, curves=curves, style=style,
+        pictures=pictures.draw(curves, [float(one) for one in frequencies], report.recording.units),
         effects=rows.effects(report), coefficients=rows.coefficients(report), errors=rows.errors(report),
         modes=rows.modes(report), horizons=rows.horizons(report), left=rows.left(report),
         instead=rows.instead(report), tried=_bars(report),
         alternatives=rows.alternatives(report),
-        interrupted=INTERRUPTED, scale=_scale(report, curves.residual.limit),
+        units=in_words(report.recording.units), interrupted=INTERRUPTED, scale=_scale(report, curves.residual.limit),
         swing=1 < report.recording.sites < pictures.MAPPED,
         origin=[] if about is None else [line.partition(": ")[::2] for line in lines(about.model_dump())],
     )  # fmt: skip

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.report.curves import PictureCurves, ResidualCurve, WorstForecast, forecast_error
+from latticebench.bench.report.units import UNKNOWN, Units, axis, rate_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,28 +30,33 @@ MAPPED = 4
 WIDTH, HEIGHT = 5.0, 3.0
 
 
-def draw(curves: PictureCurves, frequencies: Sequence[float]) -> dict[str, str]:
+def draw(curves: PictureCurves, frequencies: Sequence[float], units: Units = UNKNOWN) -> dict[str, str]:
     """Return the pictures of a diagnosis as SVG elements, by name: maps, spectrum, forecast and its growth.
 
     Args:
         curves: what is drawn.
         frequencies: angular ones that were found, to be marked in the spectrum.
+        units: of the recording.
     """
     residual = curves.residual
     sides = [("before", residual.before, BEFORE), ("after", residual.after, AFTER)]
     shown = [(name, curve, colour) for name, curve, colour in sides if curve is not None]
-    drawn = {f"map-{name}": residual_over_time(curve, residual.limit, colour) for name, curve, colour in shown}
-    drawn["spectrum"] = spectrum([(colour, curve.omega, curve.power) for _, curve, colour in shown], frequencies)
-    drawn["forecast"] = prediction(curves.forecast)
-    drawn["growth"] = growth(curves.forecast)
+    drawn = {
+        f"map-{name}": residual_over_time(curve, residual.limit, colour, units.time) for name, curve, colour in shown
+    }
+    drawn["spectrum"] = spectrum(
+        [(colour, curve.omega, curve.power) for _, curve, colour in shown], frequencies, units.time
+    )
+    drawn["forecast"] = prediction(curves.forecast, units)
+    drawn["growth"] = growth(curves.forecast, units.time)
     return drawn
 
 
-def residual_over_time(curve: ResidualCurve, limit: float, colour: str) -> str:
+def residual_over_time(curve: ResidualCurve, limit: float, colour: str, time: str = "") -> str:
     """Draw a residual site against time: as a map, or for a few sites as lines."""
     if curve.values.shape[-1] >= MAPPED:
-        return site_map(curve.t, curve.values, limit)
-    return traces(curve.t, curve.values, limit, colour)
+        return site_map(curve.t, curve.values, limit, time)
+    return traces(curve.t, curve.values, limit, colour, time)
 
 
 def _axes() -> tuple[Figure, Axes]:
@@ -92,7 +98,7 @@ def _svg(figure: Figure, salt: str) -> str:
     return " ".join(words) + text[begin:]
 
 
-def site_map(t: np.ndarray, left: np.ndarray, limit: float) -> str:
+def site_map(t: np.ndarray, left: np.ndarray, limit: float, time: str = "") -> str:
     """Draw a residual (T, parts, N), site against time; nothing left is transparent."""
     from matplotlib.ticker import MaxNLocator
 
@@ -120,7 +126,7 @@ def site_map(t: np.ndarray, left: np.ndarray, limit: float) -> str:
         image, aspect="auto", origin="lower", interpolation="none",
         extent=(t[0] - half, t[-1] + half, 0.5, values.shape[0] + 0.5),
     )  # fmt: skip
-    axes.set_xlabel("t")
+    axes.set_xlabel(axis("t", time))
     axes.set_ylabel("site")
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return _svg(figure, f"map {float(np.nansum(np.abs(values))):.6g}")
@@ -138,7 +144,7 @@ def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t[kept], values[kept]
 
 
-def traces(t: np.ndarray, left: np.ndarray, limit: float, colour: str) -> str:
+def traces(t: np.ndarray, left: np.ndarray, limit: float, colour: str, time: str = "") -> str:
     """Draw the residual (T, parts, N) of a few sites as lines, one above the other."""
     figure, axes = _axes()
     gap = 2.2 * limit
@@ -159,11 +165,11 @@ def traces(t: np.ndarray, left: np.ndarray, limit: float, colour: str) -> str:
         axes.set_ylabel("residual / noise")
     else:
         axes.set_yticks(centres, [f"site {site + 1}" for site in range(sites)])
-    axes.set_xlabel("t")
+    axes.set_xlabel(axis("t", time))
     return _svg(figure, f"traces {colour}")
 
 
-def spectrum(lines: Sequence[tuple[str, np.ndarray, np.ndarray]], found: Sequence[float]) -> str:
+def spectrum(lines: Sequence[tuple[str, np.ndarray, np.ndarray]], found: Sequence[float], time: str = "") -> str:
     """Draw spectra (colour, frequencies, powers), with the frequencies that were found as dotted lines."""
     from matplotlib.ticker import LogLocator, NullLocator
 
@@ -187,38 +193,39 @@ def spectrum(lines: Sequence[tuple[str, np.ndarray, np.ndarray]], found: Sequenc
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if highest < 100 * lowest else (1.0,)))
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_xlabel("angular frequency")
+    axes.set_xlabel(axis("angular frequency", rate_of("rad", time)))
     axes.set_ylabel("power / noise")
     return _svg(figure, "spectrum")
 
 
-def prediction(shown: WorstForecast) -> str:
-    """Draw the readings of one site and what the equations predict for it."""
+def prediction(shown: WorstForecast, units: Units = UNKNOWN) -> str:
+    """Draw the readings of one site and what the equations predict for it, in the unit of the file if it is known."""
+    scale = units.scale if units.reading else 1.0
     site = shown.site - 1
     figure, axes = _axes()
     sides = [
         (one, *kind) for one, kind in ((shown.before, (BEFORE, "--")), (shown.after, (AFTER, "-"))) if one is not None
     ]
-    seen = np.concatenate([one.seen[:, 0, site] for one, _, _ in sides])
+    seen = np.concatenate([one.seen[:, 0, site] / scale for one, _, _ in sides])
     seen = seen[np.isfinite(seen)]
     low, high = (float(np.min(seen)), float(np.max(seen))) if len(seen) else (-1.0, 1.0)
     # A forecast that runs away must not hide the readings.
     room = 0.6 * (high - low) + 1e-9 * max(abs(low), abs(high)) or 1.0
     for one, _, _ in sides:
-        t, values = thinned(one.t, one.seen[:, 0, site])
+        t, values = thinned(one.t, one.seen[:, 0, site] / scale)
         dense = len(one.t) > 150
         style = "-" if len(one.t) > POINTS else "o"
         axes.plot(t, values, style, color=INK, markersize=2.0 if dense else 4.0, linewidth=0.8)
     for one, colour, style in sides:
-        t, values = thinned(one.t, np.clip(one.predicted[:, 0, site], low - 2 * room, high + 2 * room))
+        t, values = thinned(one.t, np.clip(one.predicted[:, 0, site] / scale, low - 2 * room, high + 2 * room))
         axes.plot(t, values, style, color=colour, linewidth=1.8)
     axes.set_ylim(low - room, high + room)
-    axes.set_xlabel("t")
-    axes.set_ylabel(f"u at site {site + 1}")
+    axes.set_xlabel(axis("t", units.time))
+    axes.set_ylabel(axis(f"u at site {site + 1}", units.reading))
     return _svg(figure, "forecast")
 
 
-def growth(shown: WorstForecast) -> str:
+def growth(shown: WorstForecast, time: str = "") -> str:
     """Draw how the error of the forecast over all sites grows, in units of the noise."""
     figure, axes = _axes()
     highest = 1.0
@@ -231,6 +238,6 @@ def growth(shown: WorstForecast) -> str:
         highest = max(highest, float(np.nanmax(size)) if np.any(np.isfinite(size)) else 1.0)
     axes.axhline(1.0, color=INK, linewidth=0.8, linestyle="--")
     axes.set_ylim(0, 1.08 * highest)
-    axes.set_xlabel("t")
+    axes.set_xlabel(axis("t", time))
     axes.set_ylabel("error / noise")
     return _svg(figure, "growth")

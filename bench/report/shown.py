@@ -27,6 +27,7 @@ class Shown(Content):
         seen: readings of u by time, part (real, imaginary) and site.
         noise: standard deviation of the noise of each site in the units of u, or None.
         curves: what equations make of the readings, likewise, by name.
+        unit, time_unit: of the readings and of the times; "" where they are not known.
     """
 
     source: str
@@ -35,6 +36,8 @@ class Shown(Content):
     seen: Values
     noise: tuple[Number, ...] | None
     curves: dict[str, Values]
+    unit: str = ""
+    time_unit: str = ""
 
     @classmethod
     def of(cls, overlay: Overlay) -> Shown:
@@ -43,6 +46,7 @@ class Shown(Content):
             source=overlay.source, rows=overlay.rows, t=tuple(overlay.t.tolist()), seen=_written(overlay.seen),
             noise=None if overlay.noise is None else tuple(overlay.noise.tolist()),
             curves={name: _written(values) for name, values in overlay.curves.items()},
+            unit=overlay.unit, time_unit=overlay.time_unit,
         )  # fmt: skip
 
     def overlay(self) -> Overlay:
@@ -59,7 +63,7 @@ class Shown(Content):
             raise ValueError("times, readings and curves do not match")
         if noise is not None and noise.shape != seen.shape[2:]:
             raise ValueError("the noise is not that of the sites")
-        return Overlay(self.source, self.rows, t, seen, None, noise, curves)
+        return Overlay(self.source, self.rows, t, seen, None, noise, curves, self.unit, self.time_unit)
 
 
 def _written(values: ndarray) -> Values:

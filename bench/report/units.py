@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from latticebench.bench.escape import label
 from latticebench.bench.report.document import Content, Number
 from latticebench.diagnosis.instrument import describe
 
@@ -37,6 +38,9 @@ class Units(Content):
     scale: Number
 
 
+UNKNOWN = Units(time="", reading="", equation="", scale=1.0)
+
+
 def units_of(origin: Origin) -> Units:
     """Return the units of a recording."""
     return Units(time=origin.time, reading=origin.unit, equation=origin.becomes, scale=origin.scale)
@@ -52,6 +56,16 @@ def in_words(units: Units) -> str:
     if units.scale != 1 and not units.equation:
         parts.append(f"u is {units.scale:g} times the reading")
     return "; ".join(parts)
+
+
+def axis(name: str, unit: str) -> str:
+    """Return what stands at an axis: a quantity over its unit; the quantity alone where that is not known."""
+    return label(f"{name} / {f'({unit})' if '/' in unit else unit}" if unit else name)
+
+
+def rate_of(unit: str, time: str) -> str:
+    """Return the unit of a quantity's change in time; "" where one of both is not known."""
+    return f"{unit}/{time}" if unit and time else ""
 
 
 def with_unit(value: str, unit: str) -> str:
@@ -88,7 +102,7 @@ def noise_in_words(noise: Noise, steps: Sequence[float], interval: float, sites:
     for begin in range(0, len(noise.size), sites):
         own = slice(begin, begin + sites)
         part = replace(noise, size=noise.size[own] / abs(units.scale), memory=noise.memory[own])
-        unit = units.reading if begin == 0 else f"{units.reading}/{units.time}" if units.reading and units.time else ""
+        unit = units.reading if begin == 0 else rate_of(units.reading, units.time)
         grid = [step / abs(units.scale) for step in steps[own]]
         lines += [("velocity, " if begin else "") + line for line in describe(part, grid, unit, interval=interval)]
     return lines

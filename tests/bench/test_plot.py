@@ -10,10 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 
 from latticebench import methods, systems
 from latticebench.bench import animation
+from latticebench.bench.adequacy import adequacy
 from latticebench.bench.cli import main
 from latticebench.bench.overlay import Overlay, of_fit, of_recording
 from latticebench.bench.plots import panels, plot
@@ -22,7 +25,7 @@ from latticebench.bench.report.shown import Shown
 from latticebench.methods.method import make, solve
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
-from latticebench.systems.samples import Samples
+from latticebench.systems.samples import Origin, Samples
 from latticebench.systems.simulate import observe, simulate
 from latticebench.systems.writers import write
 
@@ -102,6 +105,50 @@ def test_every_panel_is_drawn_of_any_chain_with_gaps_and_uneven_times(sites: int
         assert sum(part.get_visible() for part in figure.get_axes()) >= len(panels(overlay))
 
 
+def degrees(swings: Samples) -> Samples:
+    """The same wave, as it is read of a file in degrees and milliseconds."""
+    origin = Origin(time="ms", unit="deg", scale=np.pi / 180, becomes="rad")
+    return replace(swings, origin=origin)
+
+
+def words_of(figure: Figure) -> set[str]:
+    """What stands at the axes of a figure."""
+    figure.draw_without_rendering()
+    return {text.get_text() for text in figure.findobj(Text) if text.get_visible()}
+
+
+def test_axes_carry_the_units_of_the_file_and_readings_are_drawn_in_them(swings: Samples) -> None:
+    fit = solve(make(methods.find("weak"), {}), [swings], library("terms", TERMS), 2, 1)
+    alone, beside = of_recording(degrees(swings)), of_fit([degrees(swings)], fit)
+    for overlay in (alone, beside):
+        np.testing.assert_allclose(overlay.seen[:, 0], np.degrees(swings.u))
+        again = Shown.model_validate_json(Shown.of(overlay).model_dump_json()).overlay()
+        said = words_of(plot(again, list(panels(again))))
+        assert {"t / ms", "u / deg", "angular frequency / (rad/ms)", "slope of u / (deg/ms)"} <= said
+        assert not said & {"t", "u", "angular frequency"}
+    # The noise is that of the readings, and what is left is in its units as before.
+    plain = of_fit([swings], fit)
+    np.testing.assert_allclose(beside.residual("weak"), plain.residual("weak"), rtol=1e-9)
+    assert {"t", "u", "angular frequency"} <= words_of(plot(of_recording(swings)))
+
+
+def test_a_scale_without_a_unit_leaves_the_picture_in_that_of_the_equation(swings: Samples) -> None:
+    origin = Origin(scale=1e-3)
+    np.testing.assert_array_equal(of_recording(replace(swings, origin=origin)).seen[:, 0], swings.u)
+
+
+def test_the_page_of_a_fit_says_first_whether_the_equation_fits(swings: Samples) -> None:
+    data = [degrees(swings)]
+    for terms, fits in ((TERMS, True), ("u[n]", False)):
+        found = solve(make(methods.find("weak"), {}), data, library("terms", terms), 2, 1)
+        quality = adequacy(data, found)
+        text = fit_page(found, of_fit(data, found), quality)
+        assert ("the equation does not fit" in text) is not fits
+        assert quality.in_words.split(";")[0] in text
+        assert "t in ms, readings in deg" in text
+        assert ">t / ms<" in text
+
+
 def test_pictures_are_what_their_ending_says_and_films_move(run: Run, swings: Samples, tmp_path: Path) -> None:
     write([replace(swings, t=swings.t[:9], u=swings.u[:9], v=None)], tmp_path / "swings.csv")
     for ending, begin in FIRST.items():
@@ -175,7 +222,7 @@ def test_the_page_of_a_fit_has_data_table_and_pictures_and_lets_nothing_run(swin
     own = library("terms", TERMS)
     found = solve(make(methods.find("weak"), {}), [swings], own, 2, 1)
     overlay = of_fit([replace(swings, source=evil)], found)
-    text = fit_page(found, overlay)
+    text = fit_page(found, overlay, adequacy([swings], found))
     assert "<script" not in text
     assert "default-src 'none'" in text
     assert text.count("<svg ") == len(panels(overlay)) == 5
