@@ -66,6 +66,10 @@ def animate(overlay: Overlay, path: Path, about: Mapping[str, Any]) -> None:
             )
             drawn.append((line, values[:, part]))
     _furnish(axes, overlay)
+    # Places are the same in every picture, and finding them takes longer than drawing.
+    axes.set_title("t", fontsize=10, loc="left")
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
 
     def show(row: int) -> list[Any]:
         for line, values in drawn:

@@ -129,10 +129,10 @@ def show(
             show_note(line)
 
 
-def rows(store: Store, shard: Shard = WHOLE) -> list[dict[str, Any]]:
-    """Return one row per case, the kinds one after the other."""
+def rows(store: Store, shard: Shard = WHOLE, beside: Published | None = None) -> list[dict[str, Any]]:
+    """Return one row per case, the kinds one after the other; fits with published ones of the same cases."""
     with store.sound():
-        found = [kind.table(results) for _, kind, results, _ in each(store, shard)]
+        found = [kind.table(results) for _, kind, results, _ in each(store, shard, beside=beside)]
     return [{str(name): value for name, value in row.items()} for frame in found for row in frame.to_dict("records")]
 
 

@@ -1,8 +1,8 @@
 """Find the equations of motion of nonlinear lattices from data, and measure how well each method does it.
 
-For notebooks, each loaded when it is first used (`latticebench.recording`, `latticebench.front`):
+For notebooks, each loaded when it is first used:
 
-- `read` a recording, `Model` an equation or take that of a `system`;
+- `read` a recording, look at it (`plot`, `animate`), `Model` an equation or take that of a `system`;
 - `fit` its coefficients, `diagnose` what it lacks, know the `limit` of what can be known;
 - `run` a suite of the benchmark, look at published `results`.
 
@@ -22,26 +22,23 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from latticebench.front import (
-        Bound,
-        Cause,
-        Fitted,
-        Run,
-        diagnose,
-        fit,
-        limit,
-        results,
-        run,
-    )  # fmt: skip
+    from latticebench.fitted import Fitted, Residual, fit
+    from latticebench.front import Bound, Cause, Run, diagnose, limit, results, run
+    from latticebench.pictures import Film, Picture
     from latticebench.recording import Model, Recording, read, system
 
 ROOMS = ("systems", "methods", "diagnosis", "bench")
-# What lies in `latticebench.recording`; the other functions and classes lie in `latticebench.front`.
-GIVEN = ("Model", "Recording", "read", "system")
+# In which module of this package a name lies.
+PLACES = {
+    "Model": "recording", "Recording": "recording", "read": "recording", "system": "recording",
+    "Fitted": "fitted", "Residual": "fitted", "fit": "fitted", "Film": "pictures", "Picture": "pictures",
+    "Bound": "front", "Cause": "front", "Run": "front", "diagnose": "front", "limit": "front", "results": "front",
+    "run": "front",
+}  # fmt: skip
 
 __all__ = [
-    "Bound", "Cause", "Fitted", "Model", "Recording", "Run", "__version__", "bench", "diagnose", "diagnosis", "fit",
-    "limit", "methods", "read", "results", "run", "system", "systems",
+    "Bound", "Cause", "Film", "Fitted", "Model", "Picture", "Recording", "Residual", "Run", "__version__", "bench",
+    "diagnose", "diagnosis", "fit", "limit", "methods", "read", "results", "run", "system", "systems",
 ]  # fmt: skip
 
 
@@ -57,8 +54,8 @@ def __getattr__(name: str) -> Any:
         return version("latticebench")
     if name in ROOMS:
         return importlib.import_module(f"{__name__}.{name}")
-    if name in __all__:
-        return getattr(importlib.import_module(f"{__name__}.{'recording' if name in GIVEN else 'front'}"), name)
+    if name in PLACES:
+        return getattr(importlib.import_module(f"{__name__}.{PLACES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -12,154 +12,28 @@ Results show themselves in a notebook as tables or pages; tables are pandas Data
 
 from __future__ import annotations
 
+import functools
 import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 
-from latticebench import methods
-from latticebench.bench.adequacy import Adequacy, adequacy
-from latticebench.bench.inspection import sine_warning
-from latticebench.bench.report.mathematics import written
-from latticebench.methods.method import Fit, Skipped, make, solve
+from latticebench.bench.overlay import of_diagnosis
+from latticebench.bench.report.rows import html_table
+from latticebench.methods.method import Skipped
+from latticebench.pictures import Film, Picture
 from latticebench.recording import Model, Recording
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError
-from latticebench.systems.motion import Motion
-from latticebench.systems.samples import Samples
-from latticebench.systems.simulate import integrate
-from latticebench.systems.terms import combination
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from latticebench.bench.limit import Design, Limit
+    from latticebench.bench.overlay import Overlay
     from latticebench.bench.report.content import Report
     from latticebench.diagnosis.repair import Diagnosis
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A fit of a model to a recording.
-
-    Attributes:
-        result: coefficients, standard errors, seconds, ... (`latticebench.methods.method.Fit`).
-        quality: how well the equation describes the readings.
-        model, data: what was fitted to what.
-    """
-
-    result: Fit
-    quality: Adequacy
-    model: Model
-    data: Recording
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """The coefficients by term, with standard errors where the method gives them."""
-        columns: dict[str, Any] = {"coefficient": self.result.coefficients}
-        if self.result.stderr is not None:
-            columns["standard error"] = self.result.stderr
-        return pd.DataFrame(columns, index=pd.Index(self.result.library.texts, name="term"))
-
-    @property
-    def equation(self) -> str:
-        """The equation with its coefficients, in one line."""
-        return written(self.result)
-
-    @property
-    def latex(self) -> str:
-        """The equation in LaTeX."""
-        from latticebench.bench.report.mathematics import expression, latex_summand
-
-        pairs = [pair for pair in zip(self.result.library.texts, self.result.coefficients, strict=True) if pair[1]]
-        sums = [latex_summand(float(value), expression(text), first=not k) for k, (text, value) in enumerate(pairs)]
-        return rf"\{'d' * self.model.order}ot{{u}}_{{n}} = {' '.join(sums) or '0'}"
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What has to be known before a number is used; empty where the equation fits."""
-        return self.quality.warnings
-
-    def confidence(self, level: float = 0.95) -> pd.DataFrame:
-        """Return the interval of each coefficient that holds the truth with a probability, if the equation is right.
-
-        Raises:
-            InputError: the method gives no standard errors, or the level is not between 0 and 1.
-        """
-        from scipy.stats import norm
-
-        if self.result.stderr is None:
-            raise InputError(f"method {self.result.method!r} gives no standard errors; fit with another")
-        if not 0 < level < 1:
-            raise InputError(f"level is {level!r}; it must be between 0 and 1")
-        half = float(norm.isf((1 - level) / 2)) * self.result.stderr
-        bounds = {"lower": self.result.coefficients - half, "upper": self.result.coefficients + half}
-        return pd.DataFrame(bounds, index=self.table.index)
-
-    def simulate(self, u: ArrayLike, v: ArrayLike | None = None, *, t: ArrayLike) -> Recording:
-        """Return the motion of the fitted equation from a state.
-
-        Args:
-            u: the field at the first time (sites,).
-            v: its velocity, for order 2; at rest if not given.
-            t: times (T,).
-
-        Raises:
-            InputError: the ends are unknown, or the motion grows without bound.
-        """
-        if self.model.ends == "unknown":
-            raise InputError('a chain with unknown ends cannot be simulated; give the model ends, such as ends="free"')
-        start, times = np.asarray(u), np.asarray(t, float)
-        term = combination(self.result.library.terms, [float(value) for value in self.result.coefficients])
-        chain = Motion(term, self.model.order, np.iscomplexobj(start), len(start), self.model.ends)
-        states = integrate(chain, chain.pack(start, None if v is None else np.asarray(v)), times)
-        found = chain.unpack(states)
-        return Recording((Samples(times, found[0], found[1], source="fitted equation", ends=self.model.ends),))
-
-    def __repr__(self) -> str:
-        lines = [f"Warning: {line}." for line in self.warnings]
-        return "\n".join([*lines, self.equation, self.table.to_string(), self.quality.in_words])
-
-    def _repr_html_(self) -> str:
-        lines = "".join(f"<p><b>Warning:</b> {html.escape(line)}.</p>" for line in self.warnings)
-        told = f"<p><code>{html.escape(self.equation)}</code></p>"
-        return f"{lines}{told}{_table(self.table, index=True)}<p>{html.escape(self.quality.in_words)}</p>"
-
-
-def fit(data: Recording, model: Model, method: str = "trajectory", seed: int = 1, **settings: Any) -> Fitted:
-    """Fit the coefficients of a model to a recording.
-
-    Args:
-        data: the recording.
-        model: the equation.
-        method: a name from `latticebench list methods`, or a .py file.
-        seed: of the method's own draws.
-        settings: of the method.
-
-    Raises:
-        InputError: the method cannot fit such a recording.
-
-    Examples:
-        >>> import latticebench as lb
-        >>> import numpy as np
-        >>> t = np.linspace(0, 10, 200)
-        >>> data = lb.read((t, np.cos(1.5 * t)))
-        >>> found = lb.fit(data, lb.Model("u[n]", ends="free"), method="least-squares")
-        >>> round(float(found.table.loc["u[n]", "coefficient"]), 3)
-        -2.25
-        >>> found.warnings
-        ()
-    """
-    samples, terms = model.of(data), model.library
-    try:
-        result = solve(make(methods.find(method), settings), samples, terms, model.order, seed)
-    except Skipped as reason:
-        raise InputError(f"method {method!r} cannot fit {samples[0].source}: {reason}; choose another") from None
-    return Fitted(result, adequacy(samples, result).also(sine_warning(samples, terms)), model, data)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +44,23 @@ class Cause:
         result: all that is known (`latticebench.diagnosis.repair.Diagnosis`).
         report: what is said of it.
         declared: the equation that was examined.
+
+    Examples:
+        >>> import latticebench as lb
+        >>> import numpy as np
+        >>> t = np.arange(0, 20, 0.1)
+        >>> noise = 0.001 * np.random.default_rng(1).standard_normal(len(t))
+        >>> data = lb.read((t, 0.1 * np.exp(-0.05 * t) * np.cos(2 * t) + noise))
+        >>> cause = lb.diagnose(data, lb.Model("u[n]", ends="free"))
+        >>> cause.verdict
+        'explained'
+        >>> cause.model
+        Model("u[n]; v[n]", order=2, ends="free")
+        >>> again = lb.fit(data, cause.model)
+        >>> round(float(again.table.loc["v[n]", "coefficient"]), 2)
+        -0.1
+        >>> cause.plot("sites")
+        Picture(arrays: sites)
     """
 
     result: Diagnosis
@@ -201,7 +92,10 @@ class Cause:
 
     @property
     def model(self) -> Model:
-        """The declared terms and those found that act at every site; what acts elsewhere is in `elsewhere`."""
+        """The declared terms and those found that act at every site, to be fitted again.
+
+        What acts at single sites, at the ends and on the readings is in `elsewhere`; a term cannot say it.
+        """
         terms = "; ".join(one.text for one in self.report.equation.after.terms)
         return Model(terms, self.declared.order, self.declared.ends)
 
@@ -217,6 +111,25 @@ class Cause:
         from latticebench.bench.report.page import page
 
         return page(self.report, curves(self.result))
+
+    @functools.cached_property
+    def _overlay(self) -> Overlay:
+        return of_diagnosis(self.result)
+
+    def plot(self, *only: str) -> Picture:
+        """Draw the readings, what both equations make of them, and what they leave.
+
+        Args:
+            only: names of panels: map, sites, residual, spectrum, phase; all that tell something if there are none.
+
+        Raises:
+            InputError: there is no such panel.
+        """
+        return Picture(self._overlay, only)
+
+    def animate(self) -> Film:
+        """Return a film of the readings with both motions, which a notebook shows and `save` writes."""
+        return Film(self._overlay)
 
     def save(self, path: str | Path) -> Path:
         """Write the page, whole or not at all."""
@@ -237,6 +150,13 @@ class Cause:
 def diagnose(data: Recording, model: Model) -> Cause:
     """Find what a declared equation lacks of a recording.
 
+    Args:
+        data: the recording.
+        model: the declared equation.
+
+    Returns:
+        what was found; see `Cause` for an example.
+
     Raises:
         InputError: the equation cannot be set up on it.
     """
@@ -256,6 +176,19 @@ class Bound:
         needed: what a smaller error needs.
         notes: where it is taken, and the noise of each sensor.
         warnings: why it may not hold.
+
+    Examples:
+        >>> import latticebench as lb
+        >>> import numpy as np
+        >>> t = np.arange(0, 30, 0.1)
+        >>> noise = 0.001 * np.random.default_rng(1).standard_normal(len(t))
+        >>> bound = lb.limit(lb.read((t, 0.1 * np.cos(2 * t) + noise)), lb.Model("u[n]", ends="free"))
+        >>> list(bound.table.columns)
+        ['coefficient', 'smallest error', 'verdict']
+        >>> bool(bound.table.loc["u[n]", "smallest error"] < 0.01)
+        True
+        >>> bound.needed.records
+        1
     """
 
     result: Limit
@@ -275,7 +208,7 @@ class Bound:
 
     def _repr_html_(self) -> str:
         lines = "".join(f"<p><b>Warning:</b> {html.escape(line)}.</p>" for line in self.warnings)
-        return f"{lines}{_table(self.table, index=True)}<p>{'<br>'.join(map(html.escape, self.notes))}</p>"
+        return f"{lines}{html_table(self.table, index=True)}<p>{'<br>'.join(map(html.escape, self.notes))}</p>"
 
 
 def limit(data: Recording, model: Model, target: float = 0.01) -> Bound:
@@ -285,6 +218,9 @@ def limit(data: Recording, model: Model, target: float = 0.01) -> Bound:
         data: the recording.
         model: the equation.
         target: a relative error of the coefficients; `needed` says what it takes.
+
+    Returns:
+        the bound; see `Bound` for an example.
 
     Raises:
         InputError: the equation cannot be set up on the recording.
@@ -308,6 +244,14 @@ def results(name: str | Path) -> Mapping[str, pd.DataFrame]:
 
     Raises:
         InputError: there are no tables.
+
+    Examples:
+        >>> import latticebench as lb
+        >>> tables = lb.results("default")
+        >>> "cases" in tables
+        True
+        >>> tables["cases"]["e2"].dtype
+        dtype('float64')
     """
     from latticebench.bench.published import folder_of, read_table
 
@@ -328,6 +272,17 @@ class Run:
     Attributes:
         folder: where they are kept.
         statuses: how many cases ended how.
+
+    Examples:
+        >>> import latticebench as lb
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     found = lb.run("tiny", only=["phi4 noise*"], methods=["zero"], folder=f"{folder}/mine")
+        ...     table = found.table()
+        >>> found
+        Run(1 ok; kept in ...mine)
+        >>> list(table["status"])
+        ['ok']
     """
 
     folder: Path
@@ -345,7 +300,7 @@ class Run:
         )
 
     def _repr_html_(self) -> str:
-        return f"<p>{html.escape(repr(self))}</p>{_table(self.table())}"
+        return f"<p>{html.escape(repr(self))}</p>{html_table(self.table())}"
 
 
 def run(
@@ -396,7 +351,3 @@ def _numbers(column: pd.Series[Any]) -> pd.Series[Any]:
     known = column[column != ""]
     values = pd.to_numeric(known, errors="coerce")
     return pd.to_numeric(column, errors="coerce") if len(known) and values.notna().all() else column
-
-
-def _table(frame: pd.DataFrame, *, index: bool = False) -> str:
-    return str(frame.to_html(index=index, float_format=lambda value: f"{value:.5g}", border=0))

@@ -6,7 +6,7 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,12 @@ import pandas as pd
 from latticebench import systems
 from latticebench.bench.inspection import Inspection
 from latticebench.bench.inspection import inspect as inspect_samples
+from latticebench.bench.overlay import of_recording
+from latticebench.bench.report.rows import html_table
 from latticebench.bench.report.units import in_words, units_of
+from latticebench.labelled import as_table, is_labelled
+from latticebench.pictures import Film, Picture
+from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
 from latticebench.systems.readers import from_frame, read_all
@@ -22,7 +27,10 @@ from latticebench.systems.samples import Samples, check_alike
 from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
+    import xarray
     from numpy.typing import ArrayLike
+
+    from latticebench.bench.overlay import Overlay
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +69,41 @@ class Recording:
             frames.append(pd.DataFrame(columns))
         return pd.concat(frames, ignore_index=True)
 
+    def plot(self, *only: str, trajectory: int = 1) -> Picture:
+        """Draw the readings: a map of site against time, lines, spectrum, phase planes.
+
+        Args:
+            only: names of panels: map, sites, spectrum, phase; all if there are none.
+            trajectory: which one, from 1.
+
+        Raises:
+            InputError: there is no such panel or trajectory.
+
+        >>> import latticebench as lb
+        >>> import numpy as np
+        >>> t = np.linspace(0, 10, 50)
+        >>> lb.read((t, np.cos(1.5 * t))).plot()
+        Picture(arrays: all panels)
+        """
+        return Picture(self._overlay(trajectory), only)
+
+    def animate(self, trajectory: int = 1) -> Film:
+        """Return a film of the chain, which a notebook shows and `save` writes.
+
+        Raises:
+            InputError: there is no such trajectory.
+
+        >>> import latticebench as lb
+        >>> lb.read(([0.0, 0.1, 0.2], [[1.0, 2.0], [1.5, 2.5], [2.0, 3.0]])).animate()
+        Film(arrays: 2 sites, 3 rows)
+        """
+        return Film(self._overlay(trajectory))
+
+    def _overlay(self, trajectory: int) -> Overlay:
+        if not 1 <= trajectory <= len(self.samples):
+            raise InputError(f"trajectory {trajectory}: {self.samples[0].source} has {len(self.samples)}")
+        return of_recording(self.samples[trajectory - 1])
+
     def inspect(self, model: Model | None = None) -> tuple[Inspection, ...]:
         """Return what each trajectory is like, and what is suspicious; see `latticebench inspect`."""
         return tuple(inspect_samples(one, None if model is None else model.library) for one in self.samples)
@@ -68,17 +111,25 @@ class Recording:
     def __repr__(self) -> str:
         first, units = self.samples[0], in_words(units_of(self.samples[0].origin))
         rows = sum(len(one.t) for one in self.samples)
-        parts = [f"{first.source}: {first.sites} sites, {rows} rows", f"{len(self.samples)} trajectories"]
+        parts = [
+            f"{first.source}: {first.sites} site{'s' if first.sites > 1 else ''}, {rows} rows",
+            f"{len(self.samples)} trajectories",
+        ]
         parts = [*parts[: 1 + (len(self.samples) > 1)], *([units] if units else []), *self.notes]
         return f"Recording({'; '.join(parts)})"
 
     def _repr_html_(self) -> str:
-        table = self.to_frame().head().to_html(index=False, float_format="{:.5g}".format, border=0)
-        return f"<p>{html.escape(repr(self))}</p>{table}"
+        return f"<p>{html.escape(repr(self))}</p>{html_table(self.to_frame().head())}"
 
 
 def read(
-    source: str | Path | Sequence[str | Path] | pd.DataFrame | tuple[ArrayLike, ArrayLike],
+    source: str
+    | Path
+    | Sequence[str | Path]
+    | pd.DataFrame
+    | xarray.DataArray
+    | xarray.Dataset
+    | tuple[ArrayLike, ArrayLike],
     *,
     time: str | None = None,
     columns: str | Sequence[str] = (),
@@ -88,10 +139,11 @@ def read(
     """Read a recording.
 
     Args:
-        source: a file (.csv, .txt, .tsv, .dat, .xlsx, .parquet, .npz) or several; a DataFrame; or a pair of arrays,
-            times (T,) and readings (T, sites).
-        time: the column of the times; "t" if not given.
-        columns: the columns of u by site: a pattern such as "theta_*_deg", or names; u1, u2, ... if not given.
+        source: a file (.csv, .txt, .tsv, .dat, .xlsx, .parquet, .npz) or several; a DataFrame; an xarray.DataArray of
+            time and site, or a Dataset of such; or a pair of arrays, times (T,) and readings (T, sites).
+        time: the column of the times; "t" if not given. In xarray's objects the dimension; "time" or "t".
+        columns: the columns of u by site: a pattern such as "theta_*_deg", or names; u1, u2, ... if not given. In a
+            Dataset also the variable.
         scale: what one unit of a reading is in the equation: a number, or the unit of the readings such as "deg".
         sort: sort rows by their times, and average rows of the same time.
 
@@ -109,15 +161,22 @@ def read(
         1  0.1  1.571
         >>> data.notes[-1]
         'not read: remark'
+        >>> import numpy as np
+        >>> t = np.linspace(0, 1, 3)
+        >>> lb.read((t, np.cos(t)))
+        Recording(arrays: 1 site, 3 rows)
     """
     chosen = (columns,) if isinstance(columns, str) else tuple(columns)
     layout = Layout(time, chosen, str(scale), sort)
+    if is_labelled(source):
+        table, layout = as_table(source, layout)
+        return Recording(tuple(from_frame(table, type(source).__name__, "unknown", layout)))
     if isinstance(source, pd.DataFrame):
         return Recording(tuple(from_frame(source, "table", "unknown", layout)))
     if isinstance(source, tuple) and len(source) == 2 and not isinstance(source[0], (str, Path)):
         u = np.asarray(source[1]) * layout.factor
         return Recording((Samples(np.asarray(source[0], float), u[:, None] if u.ndim == 1 else u, source="arrays"),))
-    paths = [source] if isinstance(source, (str, Path)) else list(source)
+    paths = [source] if isinstance(source, (str, Path)) else list(cast("Sequence[str | Path]", source))
     return Recording(tuple(read_all([Path(str(one)) for one in paths], "unknown", layout)))
 
 

@@ -10,9 +10,10 @@ import pandas as pd
 import pytest
 
 import latticebench as lb
-from latticebench import front, recording
+from latticebench import fitted, front, pictures, recording
 from latticebench.systems.errors import InputError
 
+MODULES = (recording, fitted, front, pictures)
 PENDULUM = lb.Model("sin(u[n])", order=2, ends="free")
 
 
@@ -24,13 +25,13 @@ def swing(scale=1.0, noise=1e-3):
 
 
 def test_the_public_names_are_these_and_all_can_be_had():
-    classes = ["Bound", "Cause", "Fitted", "Model", "Recording", "Run"]
+    classes = ["Bound", "Cause", "Film", "Fitted", "Model", "Picture", "Recording", "Residual", "Run"]
     functions = ["diagnose", "fit", "limit", "read", "results", "run", "system"]
     assert sorted(lb.__all__) == sorted([*classes, *functions, *lb.ROOMS, "__version__"])
     assert [getattr(lb, name).__doc__ for name in lb.__all__ if name != "__version__"].count(None) == 0
     defined = {
         name
-        for module in (recording, front)
+        for module in MODULES
         for name, one in vars(module).items()
         if getattr(one, "__module__", "") == module.__name__ and not name.startswith("_")
     }
@@ -39,9 +40,9 @@ def test_the_public_names_are_these_and_all_can_be_had():
         _ = lb.solve
 
 
-@pytest.mark.parametrize("module", [recording, front])
+@pytest.mark.parametrize("module", MODULES)
 def test_the_examples_in_the_docstrings_print_what_they_say(module):
-    found = doctest.testmod(module, optionflags=doctest.NORMALIZE_WHITESPACE)
+    found = doctest.testmod(module, optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
     assert found.attempted > 5
     assert found.failed == 0
 
@@ -69,6 +70,112 @@ def test_a_fit_gives_tables_intervals_and_a_simulation():
     assert found._repr_html_().count("<table") == 1
     with pytest.raises(InputError, match="unknown ends"):
         lb.fit(data, lb.Model("u[n]"), method="least-squares").simulate([1.0], t=[0, 1])
+
+
+@pytest.mark.parametrize("name", sorted(name for name in lb.__all__ if name[0].isupper()))
+def test_every_object_shows_itself_and_has_an_example(name):
+    one = getattr(lb, name)
+    assert one.__repr__ is not object.__repr__
+    assert hasattr(one, "_repr_html_") or name == "Model"
+    assert ">>> import latticebench as lb" in inspect.getdoc(one) + "".join(
+        inspect.getdoc(part) or "" for part in vars(one).values() if inspect.isfunction(part)
+    )
+
+
+def test_a_fit_leaves_a_residual_that_can_be_drawn_in_the_unit_of_the_file():
+    t = np.arange(0, 20, 0.1)
+    noise = 0.1 * np.random.default_rng(2).standard_normal(len(t))
+    frame = pd.DataFrame({"t [s]": t, "x_deg": 3 * np.cos(2 * t) + noise})
+    data = lb.read(frame, time="t [s]", columns="x_deg", scale="deg")
+    found = lb.fit(data, PENDULUM, method="least-squares")
+    left = found.residual
+    assert left.rms == pytest.approx(0.1, rel=0.3)
+    assert left.times == pytest.approx(1, abs=0.4)
+    assert "deg in the mean square" in repr(left)
+    np.testing.assert_allclose(left.to_frame()["u1"], left.values[:, 0])
+    labels = {axes.get_xlabel() for axes in left.plot().figure.axes}
+    assert labels == {"t / s", "angular frequency / (rad/s)"}
+    short = lb.read((t[:3], np.cos(t[:3])))
+    for shown in (left, left.plot(), found.plot("sites"), short.animate()):
+        assert shown._repr_html_().startswith(("<p>", '<img src="data:image/'))
+    with pytest.raises(InputError, match="unknown panel 'site'"):
+        found.plot("site")
+    with pytest.raises(InputError, match="trajectory 2"):
+        data.plot(trajectory=2)
+
+
+def test_pictures_and_films_are_written_with_what_made_them(tmp_path):
+    from PIL import Image
+
+    data = lb.read(([0.0, 0.1, 0.2], [[1.0, 2.0], [1.5, 2.5], [2.0, 3.0]]))
+    with Image.open(data.plot("map").save(tmp_path / "map.png")) as picture:
+        assert "commit" in picture.info["Description"]
+    with Image.open(data.animate().save(tmp_path / "chain.gif")) as film:
+        assert film.n_frames == 3
+    for wrong in (data.plot("map"), data.animate()):
+        with pytest.raises(InputError, match="unknown ending"):
+            wrong.save(tmp_path / "a.jpg")
+
+
+def test_the_covariance_is_that_of_nonlinear_least_squares_on_the_known_solution():
+    """The relaxation u' = a u + b has u = (u0 + b/a) exp(a t) - b/a, which SciPy fits with a covariance of its own."""
+    from scipy.optimize import curve_fit
+
+    t = np.linspace(0, 4, 120)
+
+    def motion(t, a, b, start):
+        return (start + b / a) * np.exp(a * t) - b / a
+
+    u = motion(t, -0.9, 0.6, 3.0) + 0.02 * np.random.default_rng(5).standard_normal(len(t))
+    _, expected = curve_fit(motion, t, u, p0=(-1.0, 0.5, 3.0))
+    found = lb.fit(lb.read((t, u)), lb.Model("u[n]; 1", order=1, ends="free"))
+    np.testing.assert_allclose(found.covariance, expected[:2, :2], rtol=0.03)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), found.table["standard error"])
+    with pytest.raises(InputError, match="no covariance"):
+        _ = lb.fit(lb.read((t, u)), found.model, method="least-squares").covariance
+
+
+def test_a_fit_simulates_the_motion_that_it_is_drawn_with():
+    data = swing()
+    for method in ("trajectory", "least-squares"):
+        found = lb.fit(data, PENDULUM, method=method)
+        drawn = data.samples[0].u - found.residual.values
+        np.testing.assert_allclose(found.simulate().samples[0].u, drawn, atol=1e-3)
+    later = found.simulate(t=[0.0, 60.0]).samples[0]
+    assert later.t[-1] == 60
+
+
+def test_recordings_in_xarray_are_read_as_they_are_labelled():
+    xarray = pytest.importorskip("xarray")
+    t = np.arange(5.0)
+    values = np.arange(10.0).reshape(2, 5)
+    one = xarray.DataArray(
+        values, dims=("site", "time"), coords={"time": ("time", t, {"units": "s"})}, name="theta",
+        attrs={"units": "degrees"},
+    )  # fmt: skip
+    for data in (
+        lb.read(one, scale="deg"),
+        lb.read(one.to_dataset(), scale="deg"),
+        lb.read(one.to_dataset().assign(temperature=("time", t)), columns="theta", scale="deg"),
+    ):
+        np.testing.assert_allclose(data.samples[0].u, np.radians(values.T))
+        assert (data.samples[0].origin.time, data.samples[0].origin.unit) == ("s", "deg")
+    assert "not read: temperature" in repr(data)
+    field = xarray.DataArray(values.T * 1j, dims=("t", "n"), coords={"t": t})
+    np.testing.assert_array_equal(lb.read(field).samples[0].u, values.T * 1j)
+    every = xarray.Dataset({"u": (("t", "n"), values.T), "v": (("t", "n"), 2 * values.T), "f": ("t", t)}, {"t": t})
+    (samples,) = lb.read(every).samples
+    np.testing.assert_array_equal(samples.v, 2 * values.T)
+    np.testing.assert_array_equal(samples.f, np.column_stack([t, t]))
+    dated = one.assign_coords(time=pd.date_range("2020-01-01", periods=5, freq="500ms"))
+    np.testing.assert_allclose(lb.read(dated).samples[0].t, 0.5 * t)
+    for wrong, reason in (
+        (xarray.DataArray(values, dims=("x", "y")), "there is no dimension time or t"),
+        (xarray.DataArray(values.T, dims=("time", "x")), r"assign_coords\(time="),
+        (xarray.DataArray(values[:, :, None], dims=("x", "t", "y"), coords={"t": t}), "choose with .isel"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            lb.read(wrong)
 
 
 def test_a_fit_of_degrees_warns_before_anything_else_and_names_a_remedy():
@@ -111,7 +218,7 @@ def test_a_recording_shows_itself_and_what_is_suspicious():
 
 
 def test_importing_the_package_loads_no_front():
-    names = ["latticebench.front", "latticebench.recording", "numpy"]
+    names = [*(module.__name__ for module in MODULES), "numpy"]
     script = f"import sys, latticebench; print({{*{names}}} & set(sys.modules) or 'none')"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["none"]

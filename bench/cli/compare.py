@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -46,9 +47,7 @@ def compare(
     if reference is not None:
         if new is not None:
             raise InputError(f"--against: give one run, and others of the same cases with --with {new}")
-        if as_json:
-            raise InputError("--json: it is for two runs; of --against write a table for programs with --out FILE.csv")
-        _compare_methods(old, reference, beside, out)
+        _compare_methods(old, reference, beside, out, as_json)
         return
     if new is None:
         raise InputError(f"compare {old} with what? Give a second run, or a method of this one with --against METHOD")
@@ -84,7 +83,7 @@ def _compare_runs(old: Path, new: Path, factor: float, as_json: bool) -> None:
         raise typer.Exit(1)
 
 
-def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path | None) -> None:
+def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path | None, as_json: bool) -> None:
     """Print and write how methods do against one of them.
 
     Raises:
@@ -110,9 +109,15 @@ def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path |
     files = () if out is None else _files(found, out)
     for path in files:
         check_places(read, out=path)
-    _show(found)
+    if as_json:
+        from latticebench.bench.report.document import provenance, to_json
+        from latticebench.bench.report.outputs import against_document
+
+        print(to_json(against_document(found, provenance(), about.get("published", ""))), end="")
+    else:
+        _show(found)
     for path in files:
-        print(shown(_write(found, path, about)))
+        print(shown(_write(found, path, about)), file=sys.stderr if as_json else sys.stdout)
 
 
 def _show(found: Contest) -> None:

@@ -36,6 +36,7 @@ def figures(
         list[str] | None, typer.Option(help="Draw this kind of figure alone; may be given several times.")
     ] = None,
     beside: Beside = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for a program.")] = False,
 ) -> None:
     """Draw the results of a run: coefficients by iteration, errors by time and noise, effects by what was named."""
     from latticebench.bench import kinds
@@ -46,16 +47,25 @@ def figures(
     store = open_store(folder)
     published = None if beside is None else read_published(beside)
     if out is not None and out.suffix.lower() in ENDINGS:
-        _draw_one(store, out, only, published)
-        return
-    drawn = folder / "figures" if out is None else out
-    check_places([], out=drawn / "figure.png")
-    for path in kinds.draw(store, drawn, only, published):
-        print(shown(path))
+        files = [_draw_one(store, out, only, published)]
+    else:
+        drawn = folder / "figures" if out is None else out
+        check_places([], out=drawn / "figure.png")
+        files = kinds.draw(store, drawn, only, published)
+    if as_json:
+        from latticebench.bench.report.document import provenance, to_json
+        from latticebench.bench.report.outputs import FiguresDocument
+
+        about = "" if published is None else published.about
+        found = FiguresDocument(provenance=provenance(), published=about, files=list(map(str, files)))
+        print(to_json(found), end="")
+    else:
+        for path in files:
+            print(shown(path))
 
 
-def _draw_one(store: Store, out: Path, only: list[str] | None, beside: Published | None) -> None:
-    """Draw a single figure into a file.
+def _draw_one(store: Store, out: Path, only: list[str] | None, beside: Published | None) -> Path:
+    """Draw a single figure into a file, and return that.
 
     Raises:
         InputError: its ending is that of no figure, or there are several figures, or none.
@@ -74,4 +84,4 @@ def _draw_one(store: Store, out: Path, only: list[str] | None, beside: Published
             )
         with whole(out) as temporary:
             temporary.write_bytes(found[0].read_bytes())
-    print(shown(out))
+    return out

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from latticebench.bench.cli.options import Beside, check_places, place
-from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.errors import unknown
 from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
+    from latticebench.bench.beside import Published
     from latticebench.bench.store import Shard, Store
 
 EPILOG = (
@@ -49,9 +50,7 @@ def table(
     for part in (Path(), Path("fit")) if out is not None else ():
         check_places([None if published is None else published.file], out=out / part / "cases.csv")
     if as_json:
-        if published is not None:
-            raise InputError("--json: it has the run alone; leave --with out, or take the CSV files of --out")
-        print(document(store), end="")
+        print(document(store, beside=published), end="")
     else:
         kinds.show(store, value=value, beside=published)
     if out is not None:
@@ -59,14 +58,14 @@ def table(
             print(shown(path), file=sys.stderr if as_json else sys.stdout)
 
 
-def document(store: Store, shard: Shard | None = None) -> str:
-    """Return one row per case as the text of a JSON file, see `bench.report.outputs.RunDocument`."""
+def document(store: Store, shard: Shard | None = None, beside: Published | None = None) -> str:
+    """Return one row per case, and published rows beside them, as JSON; see `bench.report.outputs.RunDocument`."""
     from latticebench.bench import kinds
     from latticebench.bench.provenance import describe
     from latticebench.bench.report.document import to_json
     from latticebench.bench.report.outputs import run_document
     from latticebench.bench.store import WHOLE
 
-    rows = kinds.rows(store, shard or WHOLE)
+    rows = kinds.rows(store, shard or WHOLE, beside)
     with store.sound():
         return to_json(run_document(rows, describe(store.origins(), store.about(), store.seeds())))

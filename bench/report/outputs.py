@@ -14,6 +14,7 @@ from latticebench.bench.report.units import Units
 
 if TYPE_CHECKING:
     from latticebench.bench.adequacy import Adequacy
+    from latticebench.bench.against import Contest
     from latticebench.bench.compare import Comparison
     from latticebench.bench.inspection import Inspection
     from latticebench.bench.limit import Design, Limit
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 # pandas has NaN where a text or a truth value is missing.
 Text = Annotated[str | None, BeforeValidator(lambda value: None if value != value else value)]
+Words = Annotated[str, BeforeValidator(lambda value: "" if value != value else value)]
 Flag = Annotated[bool | None, BeforeValidator(lambda value: None if value != value else value)]
 
 
@@ -116,9 +118,12 @@ class LimitDocument(Document):
 
 
 class FitRow(Content):
-    """A row of the table of fits; a score that a case has not is null."""
+    """A row of the table of fits; a score that a case has not is null.
 
-    part: str
+    `published` is the commit that made a row which was published, and empty in one's own.
+    """
+
+    part: Words
     data: str
     library: str
     method: str
@@ -138,9 +143,10 @@ class FitRow(Content):
     cpu_seconds: Number
     peak_mib: Number
     covered: Number
-    reason: str
-    settings: str
+    reason: Words
+    settings: Words
     identity: str
+    published: Words = ""
 
 
 class Diagnosed(Content):
@@ -231,6 +237,79 @@ class CompareDocument(Document):
     same: int
     gone: list[str]
     new: list[str]
+
+
+class AgainstMethod(Content):
+    """How a method does against another over all cases, see `bench.against.Contest`."""
+
+    method: str
+    against: str
+    cases: int
+    wins: int
+    losses: int
+    ties: int
+    ratio: Number
+    low: Number
+    high: Number
+    p: Number
+    verdict: str
+
+
+class AgainstCase(Content):
+    """One case of a method against another: ratio of their errors with its interval, and who has won."""
+
+    part: Words
+    data: str
+    library: str
+    method: str
+    against: str
+    seeds: int
+    ratio: Number
+    low: Number
+    high: Number
+    outcome: Literal["win", "loss", "tie"]
+
+
+class MeanRanks(Content):
+    """Mean ranks of methods, see `bench.against.Ranks`."""
+
+    mean: dict[str, Number]
+    cases: int
+    distance: Number
+    p: Number
+    left_out: list[str]
+
+
+class AgainstDocument(Document):
+    """Methods against one of them, see `latticebench compare --against`.
+
+    Attributes:
+        published: where the methods with an asterisk are from; empty where there are none.
+        ranks: None where there are too few methods or cases.
+    """
+
+    schema_: Literal["latticebench/against/1"] = Field(
+        default="latticebench/against/1", validation_alias="schema", serialization_alias="schema"
+    )
+    published: str
+    methods: list[AgainstMethod]
+    cases: list[AgainstCase]
+    ranks: MeanRanks | None
+
+
+class FiguresDocument(Document):
+    """The figures that were drawn of a run, see `latticebench figures`.
+
+    Attributes:
+        published: where the methods with an asterisk are from; empty where there are none.
+        files: where the figures lie.
+    """
+
+    schema_: Literal["latticebench/figures/1"] = Field(
+        default="latticebench/figures/1", validation_alias="schema", serialization_alias="schema"
+    )
+    published: str
+    files: list[str]
 
 
 class SensorReadings(Content):
@@ -341,4 +420,18 @@ def compare_document(found: Comparison, about: Provenance) -> CompareDocument:
         worse=[ComparedCase.model_validate(row) for row in found.worse.to_dict("records")],
         better=[ComparedCase.model_validate(row) for row in found.better.to_dict("records")],
         methods=[ComparedMethod.model_validate(row) for row in found.methods.to_dict("records")],
+    )  # fmt: skip
+
+
+def against_document(found: Contest, about: Provenance, published: str = "") -> AgainstDocument:
+    """Return the document of methods against one of them."""
+    ranks = found.ranks
+    return AgainstDocument(
+        provenance=about, published=published,
+        methods=[AgainstMethod.model_validate(row) for row in found.methods.to_dict("records")],
+        cases=[AgainstCase.model_validate(row) for row in found.cases.to_dict("records")],
+        ranks=None if ranks is None else MeanRanks(
+            mean={str(name): float(rank) for name, rank in ranks.mean.items()}, cases=ranks.cases,
+            distance=ranks.distance, p=ranks.p, left_out=list(ranks.left_out),
+        ),
     )  # fmt: skip

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 from latticebench.bench.report.content import Left, Report
 from latticebench.bench.report.horizons import Candidate
 from latticebench.bench.report.modes import Mode
 from latticebench.bench.report.units import with_unit
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Table = tuple[list[str], list[list[str]]]
 
@@ -155,3 +159,8 @@ def instead(report: Report) -> Table:
 
 def _place(one: Left) -> str:
     return "" if one.site is None else str(one.site)
+
+
+def html_table(frame: pd.DataFrame, *, index: bool = False) -> str:
+    """Return a table as an element of HTML, numbers with five digits."""
+    return str(frame.to_html(index=index, float_format=lambda value: f"{value:.5g}", border=0))

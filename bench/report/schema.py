@@ -10,7 +10,9 @@ import json
 from latticebench.bench.report.content import DiagnosisDocument
 from latticebench.bench.report.document import Document
 from latticebench.bench.report.outputs import (
+    AgainstDocument,
     CompareDocument,
+    FiguresDocument,
     FitDocument,
     InspectionDocument,
     LimitDocument,
@@ -21,7 +23,8 @@ from latticebench.bench.report.outputs import (
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 DOCUMENTS: dict[str, type[Document]] = {
     "fit": FitDocument, "limit": LimitDocument, "diagnosis": DiagnosisDocument, "run": RunDocument,
-    "compare": CompareDocument, "list": ListDocument, "inspection": InspectionDocument,
+    "compare": CompareDocument, "against": AgainstDocument, "figures": FiguresDocument, "list": ListDocument,
+    "inspection": InspectionDocument,
 }  # fmt: skip
 
 

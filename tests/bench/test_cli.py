@@ -10,12 +10,14 @@ import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
 import pytest
 
 from latticebench.bench.cli import main
+from latticebench.bench.report.schema import DOCUMENTS
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "measured"
 
@@ -40,6 +42,12 @@ def succeed(*arguments: object, cwd: Path) -> str:
     done = latticebench(*arguments, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def document(kind: str, text: str) -> dict[str, Any]:
+    """Return a document after it has been read as the kind that it should be."""
+    DOCUMENTS[kind].model_validate_json(text)
+    return dict(json.loads(text))
 
 
 @pytest.fixture(scope="module")
@@ -260,8 +268,17 @@ def test_a_method_in_one_file_stands_beside_the_paper_after_three_commands(tmp_p
     assert (tmp_path / "all" / "against-cases.csv").read_text().count("\n1a,phi4 C=2 v=0.5,lib1,") == 7
     bad = latticebench("figures", "mine", "--only", "errors", "--out", "errors.gif", cwd=tmp_path)
     assert (bad.returncode, "unknown ending '.gif'" in bad.stderr) == (2, True)
-    both = latticebench("table", "mine", "--with", paper, "--json", cwd=tmp_path)
-    assert (both.returncode, both.stdout, "take the CSV files of --out" in both.stderr) == (2, "", True)
+    rows = document("run", succeed("table", "mine", "--with", paper, "--json", cwd=tmp_path))["cases"]
+    assert {row["published"] for row in rows if row["method"].startswith("stlsq")} == {"b9656e544ace"}
+    assert {row["published"] for row in rows if row["method"] == "mine"} == {""}
+    found = document(
+        "against", succeed("compare", "mine", "--with", paper, "--against", "mine", "--json", cwd=tmp_path)
+    )
+    assert found["published"].startswith("results/paper")
+    assert len(found["cases"]) == sum(row["cases"] for row in found["methods"]) > 7
+    assert found["ranks"]["cases"] == 4
+    about = ("--with", paper, "--only", "errors", "--out", "a.svg", "--json")
+    assert document("figures", succeed("figures", "mine", *about, cwd=tmp_path))["files"] == ["a.svg"]
     lone = latticebench("table", "mine", "--with", root / "results" / "limits", cwd=tmp_path)
     assert (lone.returncode, "it has none of these cases" in lone.stderr) == (2, True)
 
