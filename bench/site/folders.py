@@ -164,11 +164,16 @@ def read_diagnosis(path: Path) -> DiagnosisDocument | None:
     if not isinstance(found, dict) or found.get("schema") != DiagnosisDocument.model_fields["schema_"].default:
         return None
     try:
-        return DiagnosisDocument.model_validate(found)
+        document = DiagnosisDocument.model_validate(found)
+        if document.shown is not None:
+            document.shown.overlay()
+        return document
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
         raise InputError(f"{shown(path)}: not a whole diagnosis: {printable(place)}: {first['msg']}") from None
+    except ValueError as error:
+        raise InputError(f"{shown(path)}: not a whole diagnosis: shown: {error}; write it again") from None
 
 
 def png_size(path: Path) -> tuple[int, int]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from latticebench.bench.plots import plot
 from latticebench.bench.provenance import lines
 from latticebench.bench.report import rows
 from latticebench.bench.report.content import DiagnosisDocument
@@ -19,6 +21,8 @@ from latticebench.bench.site.suites import View, of_fits, of_trials
 
 if TYPE_CHECKING:
     import jinja2
+
+    from latticebench.bench.report.shown import Shown
 
 # Where copies of the files lie.
 COPIES = "files"
@@ -122,8 +126,12 @@ class Drawing:
                 file=_file(folder, f"{stem}.md"),
             )  # fmt: skip
         for stem, one in folder.diagnoses.items():
+            drawn = f"diagnosis-{stem}.svg"
+            if one.shown is not None:
+                yield f"{folder.name}/{drawn}", _drawn(one.shown, drawn)
             yield f"{folder.name}/diagnosis-{stem}.html", self.page(
                 "diagnosis.html.j2", folder.parts, title=f"{folder.name}: {stem}", stem=stem, report=one,
+                picture=quote(drawn) if one.shown is not None else "",
                 tables=_tables(one), about=[line.partition(": ")[::2] for line in lines(one.provenance.model_dump())],
                 file=_file(folder, f"{stem}.json"),
             )  # fmt: skip
@@ -146,6 +154,7 @@ def environment() -> jinja2.Environment:
     """Return the templates of this package; they escape what they are given, and refuse a name that is missing."""
     import jinja2
     import markupsafe
+
 
     found = jinja2.Environment(
         loader=jinja2.PackageLoader("latticebench.bench.site", "templates"), autoescape=True,
@@ -238,6 +247,17 @@ def _links(folder: Folder, long: Mapping[str, Table]) -> dict[str, list[Link]]:
         for stem, one in folder.diagnoses.items()
     ]
     return {"Texts": texts, "Diagnoses": diagnoses, "More tables": tables}
+
+
+def _drawn(shown: Shown, salt: str) -> str:
+    """Draw the readings of a diagnosis and what both equations leave of them, as the text of an SVG file."""
+    import matplotlib as mpl
+
+    written = io.StringIO()
+    with mpl.rc_context({"svg.hashsalt": salt}):
+        figure = plot(shown.overlay(), ["sites", "residual"], titled=False)
+        figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None}, dpi=140)
+    return written.getvalue()
 
 
 def _heading(text: str) -> str:

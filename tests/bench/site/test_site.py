@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 import subprocess
 import sys
@@ -16,11 +17,17 @@ import pytest
 
 from latticebench.bench.cli import main
 from latticebench.bench.colours import series
+from latticebench.bench.overlay import Overlay
+from latticebench.bench.report.shown import Shown
 from latticebench.bench.site.build import MANIFEST, build
 from latticebench.bench.site.pages import number
 
 RESULTS = Path(__file__).parents[3] / "results"
 HERE = {"command": "latticebench publish"}
+MEASURED = json.loads((RESULTS / "measured" / "gliders.json").read_text(encoding="utf-8"))
+UNSOUND = json.dumps(
+    MEASURED | {"shown": {"source": "a.csv", "rows": 1, "t": [0], "seen": [[[0]]], "noise": None, "curves": {}}}
+)
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -159,6 +166,22 @@ def test_what_trials_named_is_counted(site: Path, page: Callable[..., Any]) -> N
     assert ["damping", "2", "1", "damping 1, nothing 1"] in shown.tables[0]
 
 
+def test_the_page_of_a_diagnosis_draws_the_readings_that_its_document_has(tmp_path: Path) -> None:
+    t = np.linspace(0, 3, 30)
+    seen = np.cos(t)[:, None, None] * np.ones((1, 1, 2))
+    shown = Shown.of(Overlay("a.csv", 30, t, seen, None, np.ones(2), {"declared": 0.9 * seen}, "px", "s"))
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for name, has in (("with", shown.model_dump()), ("without", None)):
+        (folder / f"{name}.json").write_text(json.dumps({**MEASURED, "shown": has}))
+    build([folder], tmp_path / "site", HERE)
+    made = tmp_path / "site" / "mine"
+    assert '<img src="diagnosis-with.svg"' in (made / "diagnosis-with.html").read_text(encoding="utf-8")
+    assert (made / "diagnosis-with.svg").read_text(encoding="utf-8").startswith("<?xml")
+    assert "The readings are not published here" in (made / "diagnosis-without.html").read_text(encoding="utf-8")
+    assert not (made / "diagnosis-without.svg").exists()
+
+
 def test_a_page_loads_nothing_from_elsewhere_and_allows_no_other_script(whole_site: Path) -> None:
     for path in whole_site.rglob("*.html"):
         text = path.read_text(encoding="utf-8")
@@ -187,6 +210,7 @@ def test_a_number_is_written_with_three_digits(cell: str, shown: str) -> None:
         ("summary.csv", "a,b\n\x00,2\n", "line 2: not a text file"),
         ("one.json", "{", "not JSON"),
         ("one.json", '{"schema": "latticebench/diagnosis/2"}', "not a whole diagnosis: provenance"),
+        ("one.json", UNSOUND, "shown: times, readings and curves do not match"),
         ("one.png", "no picture", "not a PNG"),
         ("a\nb.csv", "a\n1\n", "signs that cannot be shown"),
         (".hidden", "", "there is nothing in it"),
