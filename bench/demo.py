@@ -1,8 +1,9 @@
 """A recording to try the diagnosis on: seven coupled pendula, made by simulation and written as a laboratory does.
 
-Angles obey theta_n'' = C (theta_{n+1} + theta_{n-1} - 2 theta_n) - k_n sin(theta_n) - gamma theta_n', in radians and
-seconds, with free ends. The fifth pendulum is a little longer than the others, air brakes all of them, and the sensor
-of the third is off. The file is in degrees, with semicolons, decimal commas and a column that is none of the motion.
+Angles obey theta_n'' = C (theta_{n+1} + theta_{n-1} - 2 theta_n) - k sin(theta_n) - s_n theta_n - gamma theta_n', in
+radians and seconds, with free ends. The fifth pendulum alone hangs on an extra spring (s_n), air brakes all of them,
+and the sensor of the third is off. The file is in degrees, with semicolons, decimal commas and a column that is none
+of the motion.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
 SITES, COUPLING, STIFFNESS, DAMPING = 7, 4.0, 25.0, 0.06
-# Sites are counted from 1; the defect is a change of k there, in 1/s^2, the offset is in degrees.
-DEFECT, LONGER = 5, -3.0
+# Sites are counted from 1; the extra spring is in 1/s^2, the offset in degrees.
+DEFECT, EXTRA = 5, 3.0
 OFF, OFFSET = 3, 2.0
 NOISE, STEP, SPAN = 0.1, 0.03, 15.0
 SEED = 5
@@ -33,14 +34,14 @@ def motion() -> tuple[Float[ndarray, " time"], Float[ndarray, "time sites"]]:
     from scipy.integrate import solve_ivp
 
     draw = np.random.default_rng(SEED)
-    stiffness = np.full(SITES, STIFFNESS)
-    stiffness[DEFECT - 1] += LONGER
+    extra = np.zeros(SITES)
+    extra[DEFECT - 1] = EXTRA
 
     def rate(_: float, y: ndarray) -> ndarray:
         angle, velocity = y[:SITES], y[SITES:]
         padded = np.pad(angle, 1, mode="edge")
         pull = COUPLING * (padded[2:] + padded[:-2] - 2 * angle)
-        return np.concatenate([velocity, pull - stiffness * np.sin(angle) - DAMPING * velocity])
+        return np.concatenate([velocity, pull - STIFFNESS * np.sin(angle) - extra * angle - DAMPING * velocity])
 
     t = np.arange(0, SPAN, STEP)
     start = np.concatenate([np.deg2rad(draw.uniform(-30, 30, SITES)), np.zeros(SITES)])

@@ -41,7 +41,7 @@ def demo(
     began = time.perf_counter()
     made.write_recording(recording)
     print(
-        f"{shown(recording)}: {made.SITES} pendula, simulated; pendulum {made.DEFECT} is longer than the others, air "
+        f"{shown(recording)}: {made.SITES} pendula, simulated; pendulum {made.DEFECT} hangs on an extra spring, air "
         f"brakes all, sensor {made.OFF} reads {made.OFFSET:g} degrees too much"
     )
     data = read(recording, "free", Layout(made.TIME, (made.COLUMNS,), made.SCALE))

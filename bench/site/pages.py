@@ -155,7 +155,6 @@ def environment() -> jinja2.Environment:
     import jinja2
     import markupsafe
 
-
     found = jinja2.Environment(
         loader=jinja2.PackageLoader("latticebench.bench.site", "templates"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,

@@ -132,6 +132,7 @@ def test_the_defect_is_named_at_its_site_from_the_unedited_file(typed: Typed, tm
 @pytest.mark.slow
 def test_the_demo_finds_what_it_put_in(typed: Typed, tmp_path: Path) -> None:
     shown, _ = typed("demo", "--out", "tried")
-    for word in ("site 5 alone has", "damping", "offset of u3:", "tried/diagnosis.html"):
+    assert "With them, nothing significant is left." in shown
+    for word in ("site 5 alone has -3.", "damping", "offset of u3: 2", "tried/diagnosis.html"):
         assert word in shown, shown
     assert "<svg" in (tmp_path / "tried" / "diagnosis.html").read_text(encoding="utf-8")
