@@ -53,6 +53,7 @@ SYSTEM = System(
         ),
     ),
     source="the paper, equation (2), Table 1",
+    conserved="abs(u[n])**2",
     half_length="N/(2*sqrt(C))",
     integrator="bdf",
 )

@@ -127,6 +127,8 @@ class System:
         ends: how the chain ends.
         integrator: how it is simulated unless asked otherwise.
         notes: what else a user should know.
+        conserved: a density in the term language whose sum over all sites does not change in time, for all ends; none
+            if empty.
 
     Raises:
         InputError: a text is outside the language, or a field is invalid.
@@ -146,12 +148,13 @@ class System:
     ends: Ends = "free"
     integrator: Integrator = "dop853"
     notes: str = ""
+    conserved: str = ""
 
     def __post_init__(self) -> None:
         """Check every text and name; nothing is computed yet."""
         names = tuple(self.parameters)
         where = f"system {self.name!r}"
-        for key in ("name", "title", "equation", "half_length", "source", "notes"):
+        for key in ("name", "title", "equation", "half_length", "source", "notes", "conserved"):
             if not isinstance(getattr(self, key), str):
                 raise InputError(f"{where}: {key} is {getattr(self, key)!r}; it must be a text")
         if isinstance(self.order, bool) or self.order not in (1, 2):
@@ -169,6 +172,7 @@ class System:
             raise InputError(f"{where}: a parameter cannot be called {sorted(taken)[0]!r}; that name has a meaning")
         self.with_parameters(self.parameters)
         self._check("equation", self.equation, names)
+        self._check("conserved", self.conserved or "0", names)
         self._check("half_length", self.half_length, (*names, "N"), without=("t", "n"))
         for kind, initial in self.initials.items():
             self._check(f"initials.{kind}.u", initial.u, (*names, "x"), without=("t",))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latticebench.systems.arrays import pieces
 from latticebench.systems.compiler import Slot, compiled, partials, real_parts
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import System
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     import scipy.sparse
     from jaxtyping import Float
     from numpy import ndarray
+
+# Sites whose values stay in a processor's cache while a right-hand side is computed.
+CACHED = 2**13
 
 
 @dataclass(frozen=True)
@@ -67,17 +71,18 @@ class Motion:
             InputError: the equation has a measured input.
         """
         bundle = compiled((self.term.text,), self.is_complex)
-        gather = self._gather(bundle.slots)
+        # A part of a long chain after another: what is computed on the way stays in the processor's cache.
+        parts = [(some, self._gather(bundle.slots, some)) for some in pieces(self.sites, 1, CACHED)]
         size = self.parts * self.sites
 
         def derivative(t: float, y: ndarray) -> ndarray:
-            values = bundle.function(*gather(t, y))
             rate = np.empty_like(y)
             if self.order == 2:
                 rate[:size] = y[size:]
-            for part, value in enumerate(values):
-                first = (self.order - 1) * size + part * self.sites
-                rate[first : first + self.sites] = value
+            highest = rate[(self.order - 1) * size :].reshape(self.parts, self.sites)
+            for some, gather in parts:
+                for part, value in enumerate(bundle.function(*gather(t, y))):
+                    highest[part, some] = value
             return rate
 
         return derivative
@@ -92,7 +97,7 @@ class Motion:
         import scipy.sparse
 
         bundle, places = partials((self.term.text,), self.is_complex)
-        gather = self._gather(bundle.slots)
+        gather = self._gather(bundle.slots, slice(0, self.sites))
         size, sites = self.parts * self.sites, self.sites
         rows, columns, weights = [], [], []
         for _, part, slot in places:
@@ -122,11 +127,13 @@ class Motion:
     def _stencil(self) -> Stencil:
         return Stencil.chain(self.sites, self.term.reach, self.ends)
 
-    def _gather(self, slots: tuple[Slot, ...]) -> Callable[[float, ndarray], list[Any]]:
-        """Return the function that cuts a state into the arrays that a compiled term takes."""
-        stencil, n = self._stencil, numbers(self.sites)
+    def _gather(self, slots: tuple[Slot, ...], some: slice) -> Callable[[float, ndarray], list[Any]]:
+        """Return the function that cuts a state into the arrays that a compiled term takes at some of the sites."""
+        stencil, n = self._stencil, numbers(self.sites)[some]
+        (left, _), count = self.term.reach, some.stop - some.start
         places: list[tuple[Any, ...]] = [
-            () if slot.name in ("t", "n") else (*slot.place, *stencil.window(slot.vector)) for slot in slots
+            () if one.name in ("t", "n") else (*one.place, slice(left + one.offset, left + one.offset + count))
+            for one in slots
         ]
         shape = (self.order, self.parts, self.sites)
         if any(slot.name == "f" for slot in slots):
@@ -135,7 +142,7 @@ class Motion:
             )
 
         def arrays(t: float, y: ndarray) -> list[Any]:
-            padded = stencil.pad(y.reshape(shape))
+            padded = stencil.cut(y.reshape(shape), some)
             found: list[Any] = []
             for slot, place in zip(slots, places, strict=True):
                 if slot.name == "t":

@@ -49,6 +49,7 @@ SYSTEM = System(
         library("equation", "u[n+1]+u[n-1]-2*u[n]; u[n]; u[n]**3", "the equation's own terms"),
     ),
     source="the paper, equation (1), Table 1",
+    conserved="v[n]**2/2 + (u[n]**2-1)**2/2 - C/2*u[n]*(u[n+1]+u[n-1]-2*u[n])",
     half_length="N/(2*sqrt(C))",
     integrator="rk4",
     notes="The paper does not give the kink's speed v; 0.5 is this project's choice.",

@@ -9,6 +9,7 @@ says.
 
 from __future__ import annotations
 
+import os
 import re
 import zipfile
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latticebench.systems.arrays import IN_MEMORY
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import DATA, check_regular, reading, shown
 from latticebench.systems.layout import UNITS, Layout, choose, quoted
@@ -324,7 +326,7 @@ def _read_npz(path: Path, layout: Layout) -> dict[str, ndarray]:
                 _check_names(list(members), shown(path))
                 shapes = {name: _shape(archive, one, name, path) for name, one in members.items()}
                 check_count(sum(int(np.prod(shape, dtype=object)) for shape in shapes.values()), path)
-                return {name: _array(archive, one) for name, one in members.items()}
+                return {name: _array(archive, one, path) for name, one in members.items()}
     except InputError:
         raise
     # A damaged archive fails in many ways: zipfile's, zlib's, NumPy's.
@@ -356,10 +358,29 @@ def _shape(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, path: P
     return tuple(shape)
 
 
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> ndarray:
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, path: Path) -> ndarray:
+    """Return an array; a large one that is not compressed is mapped, and so read where it is looked at."""
+    if member.compress_type == zipfile.ZIP_STORED and member.file_size > IN_MEMORY:
+        return _mapped(member, path)
     with archive.open(member) as file:
         found: ndarray = np.lib.format.read_array(file, allow_pickle=False)
         return found
+
+
+def _mapped(member: zipfile.ZipInfo, path: Path) -> ndarray:
+    """Return an array that stands in an archive as it is; what is written to it never reaches the file.
+
+    Raises:
+        ValueError: it is not all there.
+    """
+    with path.open("rb") as file:
+        # The head of a member ends with its name and what else is told of it, whose lengths stand at 26.
+        file.seek(member.header_offset + 26)
+        file.seek(int.from_bytes(file.read(2), "little") + int.from_bytes(file.read(2), "little"), os.SEEK_CUR)
+        version = np.lib.format.read_magic(file)
+        head: Any = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, transposed, kind = head(file)
+        return np.memmap(path, kind, "c", file.tell(), shape, "F" if transposed else "C")
 
 
 def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends, layout: Layout) -> list[Samples]:
@@ -400,7 +421,7 @@ def _matrix(arrays: dict[str, ndarray], name: str, source: str) -> ndarray | Non
     if name not in arrays:
         return None
     array, count = arrays[name], len(arrays["t"])
-    array = array.astype(complex if array.dtype.kind == "c" else float)
+    array = array.astype(complex if array.dtype.kind == "c" else float, copy=False)
     if array.ndim == 1:
         array = array.reshape(-1, 1)
     if array.ndim != 2 or len(array) != count:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
+from latticebench.systems.arrays import rows_of
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library
 from latticebench.systems.stencil import Ends
@@ -89,7 +90,7 @@ class Samples:
         for name in ("u", "v", "f"):
             if getattr(self, name) is not None:
                 self._check_field(name)
-        if np.all(np.isnan(self.u)):
+        if all(np.all(np.isnan(self.u[some])) for some in rows_of(self.u)):
             raise InputError(f"{where}: every value of u is missing")
         if self.sigma is not None and not (np.isfinite(self.sigma) and self.sigma >= 0):
             raise InputError(f"{where}: sigma is {self.sigma!r}; a standard deviation is a number >= 0")
@@ -122,8 +123,11 @@ class Samples:
             )
         if np.iscomplexobj(array) and (name == "f" or not np.iscomplexobj(self.u)):
             raise InputError(f"{where}: {name} is complex; it must be real{'' if name == 'f' else ' as u is'}")
-        if np.any(np.isinf(array)):
-            row, site = (int(k) for k in np.argwhere(np.isinf(array))[0])
+        for some in rows_of(array):
+            if not np.any(np.isinf(array[some])):
+                continue
+            row, site = (int(k) for k in np.argwhere(np.isinf(array[some]))[0])
+            row += some.start
             raise InputError(
                 f"{where}: row {row + 1}, column {name}{site + 1}: infinite; leave the cell empty if it is missing"
             )
@@ -147,7 +151,8 @@ class Samples:
     @property
     def has_missing(self) -> bool:
         """Whether any value is NaN."""
-        return any(bool(np.any(np.isnan(array))) for array in (self.u, self.v, self.f) if array is not None)
+        arrays = [array for array in (self.u, self.v, self.f) if array is not None]
+        return any(bool(np.any(np.isnan(array[some]))) for array in arrays for some in rows_of(array))
 
     def forcing(self, degree: int = 3) -> Callable[[ndarray], ndarray]:
         """Return the measured input as a function of times (B,), with values (B, N).

@@ -54,6 +54,7 @@ SYSTEM = System(
         library("equation", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])", "the equation's own terms"),
     ),
     source="the paper, equation (3), Table 1",
+    conserved="v[n]**2/2 + 1 - cos(u[n]) - C/2*u[n]*(u[n+1]+u[n-1]-2*u[n])",
     half_length="N/(2*sqrt(C))",
     integrator="rk4",
     notes="The paper uses both its own kink and the phi^4 kink as initial states, and does not give their speed v.",

@@ -150,6 +150,16 @@ class Stencil:
             field = field * self._factor.reshape(self._factor.shape + (1,) * after)
         return field
 
+    def cut(self, field: ndarray, some: slice) -> ndarray:
+        """Return what is read from some of a chain's inner sites: a part of the padded field, whose last axis it is."""
+        (left, right), begin = self.reach[0], self.inner[0].start
+        first, last = begin + some.start - left, begin + some.stop + right
+        if first >= 0 and last <= self.shape[0]:
+            return field[..., first:last]
+        index, factor = (one[some.start : some.stop + left + right] for one in self._ghosts[0])
+        found = np.take(field, index, axis=-1)
+        return found if self._factor is None else found * factor
+
     @functools.cached_property
     def _windows(self) -> dict[Offset, tuple[Any, ...]]:
         found = {}

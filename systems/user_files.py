@@ -17,7 +17,7 @@ from latticebench.systems.toml import read_toml
 
 REQUIRED = ("name", "equation", "order", "initials")
 WITH_DEFAULTS = ("title", "complex", "parameters", "libraries", "source")
-OPTIONAL = ("half_length", "sites", "ends", "integrator", "notes")
+OPTIONAL = ("half_length", "sites", "ends", "integrator", "notes", "conserved")
 
 
 def load_system(path: Path) -> System:

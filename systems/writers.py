@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.systems.arrays import IN_MEMORY, empty
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import whole
 from latticebench.systems.readers import check_ending
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 def write(data: Sequence[Samples], path: Path) -> None:
     """Write trajectories to one CSV, NPZ or Parquet file, whole or not at all; numbers keep all their digits.
 
+    Arrays that are large are not compressed in an NPZ file, so that it can be read in parts.
+
     Raises:
         InputError: the ending is unknown, the trajectories differ in sites or columns, or the file cannot be written.
     """
@@ -30,8 +33,10 @@ def write(data: Sequence[Samples], path: Path) -> None:
         match path.suffix.lower():
             case ".npz":
                 # NumPy appends .npz to a path that ends otherwise, in capitals too.
+                arrays = _arrays(data)
+                large = sum(array.nbytes for array in arrays.values()) > IN_MEMORY
                 with temporary.open("wb") as handle:
-                    np.savez_compressed(handle, allow_pickle=False, **_arrays(data))
+                    (np.savez if large else np.savez_compressed)(handle, allow_pickle=False, **arrays)
             case ".csv":
                 _table(data).to_csv(temporary, index=False)
             case _:
@@ -44,10 +49,17 @@ def _arrays(data: Sequence[Samples]) -> dict[str, ndarray]:
     for name in ("u", "v", "f"):
         found = [getattr(samples, name) for samples in data]
         if found[0] is not None:
-            arrays[name] = np.concatenate(found)
+            arrays[name] = found[0] if len(found) == 1 else _joined(found)
     if len(data) > 1:
         arrays["trajectory"] = np.repeat(np.arange(1, len(data) + 1), [len(samples.t) for samples in data])
     return arrays
+
+
+def _joined(arrays: Sequence[ndarray]) -> ndarray:
+    """Return the rows of one array after those of another."""
+    whole = empty((sum(map(len, arrays)), arrays[0].shape[1]), arrays[0].dtype)
+    np.concatenate(arrays, out=whole)
+    return whole
 
 
 def _table(data: Sequence[Samples]) -> pandas.DataFrame:

@@ -45,6 +45,7 @@ def simulate(
     from latticebench.bench.effort import check_size
     from latticebench.bench.fitting import samples as make_samples
     from latticebench.systems.readers import FORMATS
+    from latticebench.systems.simulate import drift
     from latticebench.systems.writers import write
 
     check_places([system], out=out)
@@ -61,7 +62,9 @@ def simulate(
     data = make_samples(case, Path())
     write([one.observed() for one in data], out)
     listed = ", ".join(f"{name}={value:g}" for name, value in found.with_parameters(case.parameters).items())
+    drifts = [drift(found, case.parameters, one.exact, case.ends) for one in data if one.exact is not None]
+    kept = [one for one in drifts if one is not None]
     print(
         f"{shown(out)}: {found.name} ({listed}), {data[0].sites} sites, {len(data[0].t)} samples x {len(data)} "
-        f"trajectories, noise {noise:g}"
+        f"trajectories, noise {noise:g}{f'; what it conserves drifts by {max(kept):.1e}' if kept else ''}"
     )

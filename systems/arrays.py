@@ -1,0 +1,57 @@
+"""Arrays that may be larger than the memory: where they are kept, and how they are gone through piece by piece."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from latticebench.systems.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+# Bytes up to which an array is kept in memory; a larger one is a temporary file, mapped.
+IN_MEMORY = 2**27
+# Values that are computed with at once where that is free to choose: 16 MiB of double precision.
+PIECE = 2**21
+
+
+def empty(shape: tuple[int, ...], kind: Any = float) -> ndarray:
+    """Return an array without values, in memory or, above IN_MEMORY, in a temporary file (in TMPDIR) that is mapped.
+
+    The file has no name; it is gone with the array.
+
+    Raises:
+        InputError: the disk has no room for it.
+    """
+    size = math.prod(shape) * np.dtype(kind).itemsize
+    if size <= IN_MEMORY:
+        return np.empty(shape, kind)
+    try:
+        with tempfile.TemporaryFile(prefix="latticebench-") as file:
+            # A mapped file for which the disk has no room ends the process when it is written to.
+            reserve = getattr(os, "posix_fallocate", lambda handle, _, length: os.truncate(handle, length))
+            reserve(file.fileno(), 0, size)
+            return np.memmap(file, kind, "r+", shape=shape)
+    except OSError as error:
+        raise InputError(
+            f"{size / 2**20:.0f} MiB of temporary files cannot be kept in {tempfile.gettempdir()}: {error.strerror}; "
+            "set TMPDIR to a folder with more room"
+        ) from error
+
+
+def pieces(count: int, size: int, most: int = PIECE) -> Iterator[slice]:
+    """Yield slices that go through `count` rows of `size` values, each of at most `most` values or of one row."""
+    step = max(1, most // max(size, 1))
+    for begin in range(0, count, step):
+        yield slice(begin, min(begin + step, count))
+
+
+def rows_of(array: ndarray) -> Iterator[slice]:
+    """Yield the slices that go through the rows of a two-dimensional array."""
+    return pieces(array.shape[0], array.shape[1])
