@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from latticebench.methods.engine.derivatives import Differentiating
-from latticebench.methods.engine.regression import rows
+from latticebench.methods.engine.regression import sums
 from latticebench.methods.method import Fit
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
@@ -21,7 +21,7 @@ class LeastSquares(Differentiating):
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:  # noqa: ARG002
         """Minimise |y - A xi|^2."""
-        regression = rows(data, library, order, self.differentiation, self.options)
+        regression = sums(data, library, order, self.differentiation, self.options)
         coefficients = regression.least_squares()
         return Fit(self.name, library, order, coefficients, regression.residual(coefficients), status=regression.status)
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from latticebench.methods.engine.bounds import Count, NotNegative, Positive
 from latticebench.methods.engine.derivatives import Differentiating
-from latticebench.methods.engine.regression import Regression, rows
+from latticebench.methods.engine.regression import Regression, rows, sums
 from latticebench.methods.engine.sparse import make_optimizer, sparse_fit
 from latticebench.methods.method import Fit
 from latticebench.systems.lattice import Library
@@ -44,7 +44,7 @@ class STLSQ(Differentiating):
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Threshold and refit until the support stays the same."""
-        regression = rows(data, library, order, self.differentiation, self.options)
+        regression = sums(data, library, order, self.differentiation, self.options)
         arguments = {"threshold": self.threshold, "alpha": self.alpha, "max_iter": self.max_iter}
         return _fit(self.name, "STLSQ", arguments, regression, library, order, seed)
 
@@ -71,7 +71,7 @@ class SR3(Differentiating):
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Minimise the relaxed objective, then refit on the support."""
-        regression = rows(data, library, order, self.differentiation, self.options)
+        regression = sums(data, library, order, self.differentiation, self.options)
         arguments = {
             "regularizer": self.regularizer, "reg_weight_lam": self.reg_weight_lam,
             "relax_coeff_nu": self.relax_coeff_nu, "max_iter": self.max_iter, "tol": self.tol, "unbias": True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, get_args
@@ -148,7 +149,7 @@ class Samples:
         steps = np.diff(self.t)
         return bool(np.ptp(steps) <= 1e-3 * np.mean(steps))
 
-    @property
+    @functools.cached_property
     def has_missing(self) -> bool:
         """Whether any value is NaN."""
         arrays = [array for array in (self.u, self.v, self.f) if array is not None]

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from latticebench.systems.arrays import pieces
 from latticebench.systems.compiler import compiled
 from latticebench.systems.errors import InputError
 from latticebench.systems.terms import Term
@@ -77,6 +78,43 @@ def reach_of(terms: Sequence[Term]) -> tuple[int, int]:
 def numbers(sites: int) -> Float[ndarray, " sites"]:
     """Return the n of the term language at all sites of a chain."""
     return np.arange(sites) - (sites - 1) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Some neighbouring sites of a chain at which terms are evaluated, with the sites that are read around them.
+
+    Attributes:
+        sites: where they are in the chain.
+        columns: the sites that are read, increasing: a slice, or an array where the window is at an end of the chain.
+        place: where among these each site of the padded window is (padded,).
+        factor: by which it is multiplied (padded,).
+        n: the n of the term language (sites,).
+    """
+
+    sites: slice
+    columns: slice | ndarray
+    place: Int[ndarray, " padded"]
+    factor: Float[ndarray, " padded"]
+    n: Float[ndarray, " sites"]
+
+    @property
+    def own(self) -> Int[ndarray, " sites"]:
+        """Where the sites themselves are among the columns (sites,)."""
+        listed = self.columns
+        if isinstance(listed, slice):
+            return np.arange(self.sites.start - listed.start, self.sites.stop - listed.start)
+        return np.searchsorted(listed, np.arange(self.sites.start, self.sites.stop))
+
+    def pad(self, field: ndarray) -> ndarray:
+        """Return a field on the columns (..., columns) with what the ends repeat.
+
+        A wall holds zero even where the value that stands in for it is missing.
+        """
+        padded = field[..., self.place]
+        if np.all(self.factor == 1):
+            return padded
+        return np.where(self.factor == 0, 0.0, padded * self.factor)
 
 
 @dataclass(frozen=True)
@@ -160,6 +198,21 @@ class Stencil:
         found = np.take(field, index, axis=-1)
         return found if self._factor is None else found * factor
 
+    def windows(self, most: int) -> Iterator[Window]:
+        """Yield windows of at most `most` sites that go through the inner sites of a chain."""
+        (left, right), inner = self.reach[0], self.inner[0]
+        index, factor = self._ghosts[0]
+        for some in pieces(inner.stop - inner.start, 1, most):
+            sites = slice(inner.start + some.start, inner.start + some.stop)
+            read = index[some.start : some.stop + left + right]
+            columns: slice | ndarray = np.unique(read)
+            if len(columns) == columns[-1] - columns[0] + 1:
+                place, columns = read - columns[0], slice(int(columns[0]), int(columns[-1]) + 1)
+            else:
+                place = np.searchsorted(columns, read)
+            ends = factor[some.start : some.stop + left + right]
+            yield Window(sites, columns, place, ends, numbers(self.shape[0])[sites])
+
     @functools.cached_property
     def _windows(self) -> dict[Offset, tuple[Any, ...]]:
         found = {}
@@ -190,17 +243,19 @@ def evaluate(
     *,
     ends: Ends,
     reach: tuple[int, int] | None = None,
+    window: Window | None = None,
 ) -> Float[ndarray, "parts terms time sites"]:
     """Return the values of terms along a trajectory.
 
     Args:
         terms: what to evaluate.
-        u: the field (time, N), real or complex.
+        u: the field (time, N), real or complex; with a window, on its columns alone, as v and f.
         v: its velocity (time, N), or None.
         f: the measured input (time, N), or None.
         t: times.
         ends: how the chain ends; if unknown, only sites whose whole stencil lies inside are evaluated.
         reach: the stencil that decides which those are; that of `terms` if None.
+        window: of a stencil of this reach and of these ends, at whose sites alone the terms are evaluated.
 
     Returns:
         the real parts of the terms, followed for a complex field by their imaginary parts; NaN where the data are NaN.
@@ -213,25 +268,23 @@ def evaluate(
         if name in needed and array is None:
             raise InputError(f"the library uses {name}[n], but the data have no {what}")
     is_complex = np.iscomplexobj(u)
-    stencil = Stencil.chain(u.shape[1], reach_of(terms) if reach is None else reach, ends)
-    fields: dict[str, ndarray] = {}
-    for name, array in (("u", u), ("v", v), ("f", f)):
-        if array is not None:
-            # A wall holds zero even where the value that stands in for it is missing.
-            fields[name] = np.where(stencil.walls, 0.0, stencil.pad(array))
-    n = numbers(u.shape[1])[stencil.inner]
-    shape = (len(t), len(n))
+    reach = reach_of(terms) if reach is None else reach
+    if window is None:
+        window = next(Stencil.chain(u.shape[1], reach, ends).windows(u.shape[1]))
+    fields = {name: window.pad(array) for name, array in (("u", u), ("v", v), ("f", f)) if array is not None}
+    shape = (len(t), len(window.n))
     bundle = compiled(tuple(term.text for term in terms), is_complex)
     arrays: list[Any] = []
     for slot in bundle.slots:
         if slot.name == "t":
             arrays.append(np.broadcast_to(t[:, None], shape))
         elif slot.name == "n":
-            arrays.append(np.broadcast_to(n, shape))
+            arrays.append(np.broadcast_to(window.n, shape))
         else:
             field = fields[slot.name]
             part = field.imag if slot.part == "im" else field.real
-            arrays.append(part[(slice(None), *stencil.window(slot.vector))])
+            begin = reach[0] + slot.offset
+            arrays.append(part[:, begin : begin + shape[1]])
     # A term that is not finite somewhere (log of 0, an overflow) says so by its value; no warning is needed.
     with np.errstate(all="ignore"):
         values = bundle.function(*arrays)

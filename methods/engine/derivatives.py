@@ -9,7 +9,8 @@ have no noise. `spline`: the interpolating quintic spline. Any other name is one
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.method import Abilities
+from latticebench.systems.arrays import pieces, rows_of
 from latticebench.systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
@@ -103,38 +105,65 @@ def differentiate(
     kind: str,
     options: Mapping[str, Any] | None = None,
 ) -> Smoothed:
-    """Differentiate each site's series twice.
+    """Differentiate each site's series twice; see `differentiator`."""
+    return differentiator(t, field, kind, options)(field)
+
+
+def differentiator(
+    t: Float[ndarray, " time"],
+    field: Float[ndarray, "time sites"],
+    kind: str,
+    options: Mapping[str, Any] | None = None,
+) -> Callable[[Float[ndarray, "time some"]], Smoothed]:
+    """Return a function that differentiates the series of some of the sites twice.
+
+    What all sites decide together, the weight of a smoothing spline, is found beforehand.
 
     Args:
         t: times (T,).
-        field: (T, N), real or complex.
+        field: (T, N), real or complex, of all sites.
         kind: of differentiation, see the module.
         options: further arguments for pysindy's kinds.
 
     Raises:
         InputError: there is no such kind, its options are wrong, or there are too few samples.
     """
-    if np.iscomplexobj(field):
+    check_options(kind, options)
+    parts = [np.real, np.imag] if np.iscomplexobj(field) else [np.asarray]
+    if kind not in get_args(Ours):
+        each = [functools.partial(_pysindy, t, kind=kind, options=options or {}) for _ in parts]
+    elif any(np.any(np.isnan(field[some])) for some in rows_of(field)):
+        each = [functools.partial(_with_gaps, t, smooth=kind == "smoothing-spline") for _ in parts]
+    else:
+        columns = list(pieces(field.shape[1], len(t)))
+        each = [
+            _spline(t, (part(field[:, some]) for some in columns), smooth=kind == "smoothing-spline") for part in parts
+        ]
+    if len(parts) == 1:
+        return each[0]
+
+    def by_parts(some: ndarray) -> Smoothed:
         # A value of which one part is missing is missing.
-        whole = np.where(np.isnan(field), complex(np.nan, np.nan), field)
-        real, imaginary = (differentiate(t, part, kind, options) for part in (whole.real, whole.imag))
+        whole = np.where(np.isnan(some), complex(np.nan, np.nan), some)
+        real, imaginary = each[0](whole.real), each[1](whole.imag)
         return Smoothed(
             real.value + 1j * imaginary.value,
             real.first + 1j * imaginary.first,
             real.second + 1j * imaginary.second,
         )
-    check_options(kind, options)
-    if kind not in get_args(Ours):
-        return _pysindy(t, field, kind, options or {})
-    if not np.any(np.isnan(field)):
-        return _spline(t, field, smooth=kind == "smoothing-spline")
-    # With gaps every site has times of its own; a value that was not seen stays NaN.
+
+    return by_parts
+
+
+def _with_gaps(t: ndarray, field: ndarray, *, smooth: bool) -> Smoothed:
+    """Differentiate series with gaps: every site has times of its own; a value that was not seen stays NaN."""
     result = Smoothed(*(np.full(field.shape, np.nan) for _ in range(3)))
     for site in range(field.shape[1]):
         seen = ~np.isnan(field[:, site])
         if np.sum(seen) <= DEGREE:
             continue
-        one = _spline(t[seen], field[seen, site : site + 1], smooth=kind == "smoothing-spline")
+        series = field[seen, site : site + 1]
+        one = _spline(t[seen], [series], smooth=smooth)(series)
         for target, source in (
             (result.value, one.value),
             (result.first, one.first),
@@ -144,7 +173,8 @@ def differentiate(
     return result
 
 
-def _spline(t: ndarray, field: ndarray, *, smooth: bool) -> Smoothed:
+def _spline(t: ndarray, fields: Iterable[ndarray], *, smooth: bool) -> Callable[[ndarray], Smoothed]:
+    """Return a function that lays splines through series, of a smoothness that the `fields` choose together."""
     from scipy.interpolate import BSpline, make_interp_spline
 
     if len(t) <= DEGREE:
@@ -155,12 +185,17 @@ def _spline(t: ndarray, field: ndarray, *, smooth: bool) -> Smoothed:
     # The fit lives on [0, 1], so that the penalty's size does not depend on the unit of time.
     span = t[-1] - t[0]
     x = (t - t[0]) / span
-    if smooth:
-        basis = _basis(x)
-        curve = BSpline(basis.knots, _smoothing_coefficients(x, field, basis), DEGREE)
-    else:
-        curve = make_interp_spline(x, field, k=DEGREE)
-    return Smoothed(curve(x), curve(x, 1) / span, curve(x, 2) / span**2)
+    basis = _basis(x)
+    smoothing = _smoothing(x, basis, fields) if smooth else None
+
+    def differentiated(field: ndarray) -> Smoothed:
+        if smoothing is not None:
+            curve = BSpline(basis.knots, smoothing(field), DEGREE)
+        else:
+            curve = make_interp_spline(x, field, k=DEGREE)
+        return Smoothed(curve(x), curve(x, 1) / span, curve(x, 2) / span**2)
+
+    return differentiated
 
 
 def _basis(x: ndarray) -> BSplines:
@@ -171,11 +206,13 @@ def _basis(x: ndarray) -> BSplines:
     return BSplines.clamped(np.concatenate([x[:1], inner, x[-1:]]), DEGREE)
 
 
-def _smoothing_coefficients(x: ndarray, field: ndarray, splines: BSplines) -> ndarray:
-    """Return the c that minimise |field - B c|^2 + weight * integral of (fourth derivative)^2.
+def _smoothing(x: ndarray, splines: BSplines, fields: Iterable[ndarray]) -> Callable[[ndarray], ndarray]:
+    """Return the function from a field to the smoothest coefficients that follow it.
 
-    The weight is that of least generalised cross-validation. In the basis in which both parts are diagonal the hat
-    matrix has the eigenvalues 1/(1 + weight d_k), so that one eigenvalue problem serves all weights.
+    They are the c that minimise |field - B c|^2 + weight * integral of (fourth derivative)^2. The weight is that of
+    least generalised cross-validation for all `fields` together. In the basis in which both parts are diagonal the
+    hat matrix has the eigenvalues 1/(1 + weight d_k), so that one eigenvalue problem serves all weights, and the
+    mean square of each amplitude all fields.
     """
     import scipy.linalg
     from scipy.interpolate import BSpline
@@ -183,7 +220,6 @@ def _smoothing_coefficients(x: ndarray, field: ndarray, splines: BSplines) -> nd
 
     basis, count = BSpline.design_matrix(x, splines.knots, DEGREE), splines.count
     gram = np.asarray((basis.T @ basis).todense())
-    right = np.asarray(basis.T @ field)
     # Two Gauss points per knot interval integrate the square of the fourth derivative, of degree 2, exactly.
     points, weights = np.polynomial.legendre.leggauss(2)
     edges = np.unique(splines.knots)
@@ -193,22 +229,25 @@ def _smoothing_coefficients(x: ndarray, field: ndarray, splines: BSplines) -> nd
     penalty = bend.T @ (bend * (half[:, None] * weights).ravel()[:, None])
     d, modes = scipy.linalg.eigh(penalty, gram)
     d = np.maximum(d, 0.0)
-    amplitude = modes.T @ right
-    outside = float(np.sum((field - basis @ (modes @ amplitude)) ** 2)) if count < len(x) else 0.0
+    power, outside = np.zeros(count), 0.0
+    for field in fields:
+        amplitude = modes.T @ np.asarray(basis.T @ field)
+        power += np.sum(amplitude**2, axis=1)
+        if count < len(x):
+            outside += float(np.sum((field - basis @ (modes @ amplitude)) ** 2))
 
     def score(log_weight: float) -> float:
         lost = 1 - 1 / (1 + np.exp(log_weight) * d)
         return float(
-            np.log(np.sum((lost[:, None] * amplitude) ** 2) + outside + 1e-300)
-            - 2 * np.log((np.sum(lost) + len(x) - count) / len(x))
+            np.log(np.sum(lost**2 * power) + outside + 1e-300) - 2 * np.log((np.sum(lost) + len(x) - count) / len(x))
         )
 
     positive = d[d > 1e-12 * d[-1]]
     grid = np.linspace(-np.log(positive[-1]) - 10, -np.log(positive[0]) + 10, 80)
     best = int(np.argmin([score(value) for value in grid]))
     bounds = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
-    chosen = minimize_scalar(score, bounds=bounds, method="bounded").x
-    return np.asarray(modes @ (amplitude / (1 + np.exp(chosen) * d)[:, None]))
+    share = 1 / (1 + np.exp(minimize_scalar(score, bounds=bounds, method="bounded").x) * d)
+    return lambda field: np.asarray(modes @ (share[:, None] * (modes.T @ np.asarray(basis.T @ field))))
 
 
 def _pysindy(t: ndarray, field: ndarray, kind: str, options: Mapping[str, Any]) -> Smoothed:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from latticebench.methods.engine.derivatives import differentiate
+from latticebench.methods.engine.derivatives import differentiator
 from latticebench.methods.engine.scaled import lstsq
+from latticebench.systems.arrays import PIECE, rows_of
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
-from latticebench.systems.stencil import evaluate, observed
+from latticebench.systems.stencil import Stencil, Window, evaluate
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -31,36 +32,46 @@ class Regression:
         design: A, the terms' values (rows, terms).
         target: y, the derivative of order 1 or 2 (rows,).
         left_out: rows whose derivative is known but one of whose terms is not finite.
+        count: how many rows they stand for, with the same sums of squares and products; None for themselves.
     """
 
     design: Float[ndarray, "rows terms"]
     target: Float[ndarray, " rows"]
     left_out: int = 0
+    count: int | None = None
+
+    @property
+    def size(self) -> int:
+        """The number of rows, or of those that they stand for."""
+        return len(self.target) if self.count is None else self.count
+
+    @property
+    def height(self) -> float:
+        """RMS of y."""
+        return float(np.sqrt(np.mean(self.target**2) * (len(self.target) / self.size)))
 
     @property
     def status(self) -> str:
         """What a reader of the coefficients must know about the rows; "ok" where there is nothing."""
         if self.left_out:
-            return f"{self.left_out} of {self.left_out + len(self.target)} rows left out: a term is not finite there"
-        rank = int(np.linalg.matrix_rank(self.design / self.scales, tol=1e-12 * np.sqrt(self.design.size)))
-        if rank < self.design.shape[1]:
-            count = self.design.shape[1]
+            return f"{self.left_out} of {self.left_out + self.size} rows left out: a term is not finite there"
+        count = self.design.shape[1]
+        rank = int(np.linalg.matrix_rank(self.design / self.scales, tol=1e-12 * np.sqrt(self.size * count)))
+        if rank < count:
             return f"these data tell only {rank} of {count} terms apart; the coefficients are one choice of many"
         return "ok"
 
     @property
     def scales(self) -> Float[ndarray, " terms"]:
         """RMS of each column of A over that of y (terms,): xi * scales are the terms' shares of y; 1 where it is 0."""
-        columns = np.sqrt(np.mean(self.design**2, axis=0))
-        height = np.sqrt(np.mean(self.target**2))
-        scale = columns / (height if height > 0 else 1.0)
+        columns = np.sqrt(np.mean(self.design**2, axis=0) * (len(self.target) / self.size))
+        scale = columns / (self.height or 1.0)
         return np.where(scale > 0, scale, 1.0)
 
     def residual(self, coefficients: Float[ndarray, " terms"]) -> float:
         """Return the RMS of y - A xi over the RMS of y."""
-        left = np.sqrt(np.mean((self.target - self.design @ coefficients) ** 2))
-        height = np.sqrt(np.mean(self.target**2))
-        return float(left / height) if height > 0 else float(left)
+        left = replace(self, target=self.target - self.design @ coefficients).height
+        return left / (self.height or 1.0)
 
     def least_squares(self, support: ndarray | None = None) -> Float[ndarray, " terms"]:
         """Return the coefficients (terms,) that minimise |y - A xi|^2.
@@ -89,6 +100,30 @@ def triangular(regression: Regression) -> Regression:
     return Regression(triangle[:, :-1], triangle[:, -1])
 
 
+def folded(pieces: Iterable[Regression]) -> Regression:
+    """Return one regression with the sums of squares and products of all pieces.
+
+    It is the triangular factor of the QR decomposition of [A y], taken piece by piece, so that no more than one piece
+    is in memory and the conditioning is not squared, as it is in normal equations (TSQR: Demmel, Grigori, Hoemmen &
+    Langou, SIAM J. Sci. Comput. 34, A206 (2012)). A single piece is returned as it is.
+
+    All that depends on A and y by way of |y - A xi| is the same for the factor as for the rows: least squares on any
+    support, and so STLSQ, SR3, SSR and FROLS.
+    """
+    whole: Regression | None = None
+    for piece in pieces:
+        if whole is None:
+            whole = piece
+            continue
+        both = Regression(
+            np.concatenate([triangular(whole).design, piece.design]),
+            np.concatenate([triangular(whole).target, piece.target]),
+        )
+        whole = replace(triangular(both), left_out=whole.left_out + piece.left_out, count=whole.size + piece.size)
+    assert whole is not None
+    return whole
+
+
 def rows(
     data: Sequence[Samples],
     library: Library,
@@ -96,7 +131,33 @@ def rows(
     differentiation: str,
     options: Mapping[str, Any] | None = None,
 ) -> Regression:
-    """Differentiate the samples and evaluate the library on them.
+    """Return all rows of `row_pieces`."""
+    parts = list(row_pieces(data, library, order, differentiation, options))
+    if len(parts) == 1:
+        return parts[0]
+    design, target = (np.concatenate([getattr(one, name) for one in parts]) for name in ("design", "target"))
+    return Regression(design, target, sum(one.left_out for one in parts))
+
+
+def sums(
+    data: Sequence[Samples],
+    library: Library,
+    order: int,
+    differentiation: str,
+    options: Mapping[str, Any] | None = None,
+) -> Regression:
+    """Return `row_pieces` folded into one regression with the same sums; no more than one piece is in memory."""
+    return folded(row_pieces(data, library, order, differentiation, options))
+
+
+def row_pieces(
+    data: Sequence[Samples],
+    library: Library,
+    order: int,
+    differentiation: str,
+    options: Mapping[str, Any] | None = None,
+) -> Iterator[Regression]:
+    """Differentiate the samples and evaluate the library on them, on some neighbouring sites after others.
 
     For the second derivative an observed velocity is differentiated once; where none was observed, u twice.
 
@@ -110,55 +171,81 @@ def rows(
     Raises:
         InputError: the differentiation fails, or no row is complete.
     """
-    designs, targets = [], []
-    left_out = 0
+    count, left_out, highest = 0, 0, 0.0
     for samples in data:
+        stencil = Stencil.chain(samples.sites, library.reach, samples.ends)
+        most = max(1, PIECE // (len(samples.t) * len(library.terms) * (1 + samples.is_complex)))
         try:
             with np.errstate(all="ignore"):
-                u = differentiate(samples.t, samples.u, differentiation, options)
-                if order == 1:
-                    v, rate = None, u.first
-                elif samples.v is None:
-                    v, rate = u.first, u.second
-                else:
-                    measured = differentiate(samples.t, samples.v, differentiation, options)
-                    v, rate = measured.value, measured.first
+                curves = _curves(samples, order, differentiation, options)
+            for window in stencil.windows(most):
+                with np.errstate(all="ignore"):
+                    u, v, rate = curves(window.columns)
+                piece = assemble(samples, library, u, v, rate, window)
+                count, left_out = count + piece.size, left_out + piece.left_out
+                highest = max(highest, float(np.max(np.abs(piece.target), initial=0.0)))
+                yield piece
         except (InputError, np.linalg.LinAlgError) as error:
             raise InputError(f"{samples.source}: {error}") from None
-        one = assemble(samples, library, u.value, v, rate)
-        designs.append(one.design)
-        targets.append(one.target)
-        left_out += one.left_out
-    design, target = np.concatenate(designs), np.concatenate(targets)
-    if len(target) == 0 and left_out:
+    if count == 0 and left_out:
         raise InputError(
             f"{data[0].source}: in every row a term of the library is not finite; are the values too large for it?"
         )
-    if len(target) == 0:
+    if count == 0:
         raise InputError(
             f"{data[0].source}: no sample has its whole stencil; there are too many missing values or too few sites"
         )
-    size = max(float(np.nanmax(np.abs(samples.u))) for samples in data)
+    size = max(float(np.nanmax(np.abs(samples.u[some]))) for samples in data for some in rows_of(samples.u))
     step = min(float(np.min(np.diff(samples.t))) for samples in data)
-    if np.max(np.abs(target)) <= ROUND_OFF * size / step**order:
+    if highest <= ROUND_OFF * size / step**order:
         raise InputError(f"{data[0].source}: nothing moves: the derivative is round-off; there is no motion to fit")
-    return Regression(design, target, left_out)
+
+
+def _curves(
+    samples: Samples, order: int, differentiation: str, options: Mapping[str, Any] | None
+) -> Callable[[slice | ndarray], tuple[ndarray, ndarray | None, ndarray]]:
+    """Return a function of some sites that gives u and v there, and the derivative to explain."""
+    field = differentiator(samples.t, samples.u, differentiation, options)
+    measured = samples.v
+    if order == 1 or measured is None:
+
+        def by_field(some: slice | ndarray) -> tuple[ndarray, ndarray | None, ndarray]:
+            u = field(samples.u[:, some])
+            return (u.value, None, u.first) if order == 1 else (u.value, u.first, u.second)
+
+        return by_field
+    velocity = differentiator(samples.t, measured, differentiation, options)
+
+    def by_velocity(some: slice | ndarray) -> tuple[ndarray, ndarray | None, ndarray]:
+        v = velocity(measured[:, some])
+        return field(samples.u[:, some]).value, v.value, v.first
+
+    return by_velocity
 
 
 def assemble(
-    samples: Samples, library: Library, u: ndarray, v: ndarray | None, rate: Float[ndarray, "time sites"]
+    samples: Samples,
+    library: Library,
+    u: ndarray,
+    v: ndarray | None,
+    rate: Float[ndarray, "time sites"],
+    window: Window | None = None,
 ) -> Regression:
     """Return the rows of one trajectory, without those that have a NaN.
 
     Args:
         samples: the trajectory: its times, input and ends.
         library: the terms.
-        u: the field (T, N) on which they are evaluated.
+        u: the field (T, N) on which they are evaluated; with a window, on its columns alone, as v and rate.
         v: its velocity, or None.
         rate: the derivative to explain.
+        window: the sites whose rows are asked for; None for all.
     """
-    values = evaluate(library.terms, u, v, samples.f, samples.t, ends=samples.ends)
-    inner = rate[:, observed(samples.sites, library.reach, samples.ends)]
+    if window is None:
+        window = next(Stencil.chain(samples.sites, library.reach, samples.ends).windows(samples.sites))
+    f = None if samples.f is None else samples.f[:, window.columns]
+    values = evaluate(library.terms, u, v, f, samples.t, ends=samples.ends, window=window)
+    inner = rate[:, window.own]
     target = np.stack([inner.real, inner.imag] if samples.is_complex else [inner]).ravel()
     design = np.moveaxis(values, 1, -1).reshape(-1, len(library.terms))
     known = np.isfinite(target)

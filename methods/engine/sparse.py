@@ -80,7 +80,7 @@ def fitted_optimizer(regression: Regression, optimizer: str, arguments: Mapping[
     Raises:
         InputError: there is no such optimiser, or it refuses its arguments or the rows.
     """
-    height = np.sqrt(np.mean(regression.target**2)) or 1.0
+    height = regression.height or 1.0
     try:
         # A solver may print its licence, which is no part of the output.
         with warnings.catch_warnings(), seeded(seed), contextlib.redirect_stdout(io.StringIO()):
