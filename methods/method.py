@@ -50,6 +50,8 @@ class Abilities:
         missing: values that are NaN.
         truth: it must be shown the truth (a ceiling, not a contestant).
         motion: its fits have the motion that they follow, and the size of the noise.
+        memory: bytes that a fit takes at most for each value of the samples and each term; 0 where it goes through
+            them piece by piece.
         loads: packages that a fit imports; they are loaded before its clock starts.
         needs: packages that are not installed with this one.
     """
@@ -60,6 +62,7 @@ class Abilities:
     missing: bool = False
     truth: bool = False
     motion: bool = False
+    memory: float = 0.0
     loads: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
 
@@ -315,4 +318,37 @@ def obstacle(abilities: Abilities, data: Sequence[Samples], library: Library) ->
             "it needs the truth, which only simulated samples know",
         ),
     ]
-    return next((reason for able, asks, reason in checks if not able and any(asks(s) for s in data)), "")
+    reason = next((reason for able, asks, reason in checks if not able and any(asks(s) for s in data)), "")
+    return reason or too_large(abilities.memory, data, library)
+
+
+def too_large(memory: float, data: Sequence[Samples], library: Library) -> str:
+    """Return that the data take more memory than there is; empty where they do not.
+
+    Args:
+        memory: bytes for each value (site, time and part) and term.
+        data: the trajectories.
+        library: the terms.
+    """
+    values = sum(samples.u.size * (1 + samples.is_complex) for samples in data)
+    needed, there = memory * values * len(library.terms), _free()
+    if needed <= there:
+        return ""
+    return (
+        f"it would take about {needed / 2**30:.2g} GiB for {values} values and {len(library.terms)} terms, and "
+        f"{there / 2**30:.2g} GiB may be used; show it fewer sites, samples or terms, or take a method that goes "
+        "through them piece by piece, as least squares does"
+    )
+
+
+def _free() -> float:
+    """Return the bytes that this process may still take: of its limit, if it has one, or of the machine."""
+    import psutil
+
+    free = float(psutil.virtual_memory().available)
+    try:
+        import resource
+    except ImportError:
+        return free
+    limit, _ = resource.getrlimit(resource.RLIMIT_DATA)
+    return free if limit == resource.RLIM_INFINITY else min(free, float(limit))

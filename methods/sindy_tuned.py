@@ -41,7 +41,7 @@ from latticebench.methods.engine.integrated_equation import (
     information_criterion,
     integrate_equation,
 )  # fmt: skip
-from latticebench.methods.engine.regression import Regression, rows, triangular
+from latticebench.methods.engine.regression import Regression, row_pieces, triangular
 from latticebench.methods.engine.sparse import THRESHOLDS, fitted_optimizer, sparse_fit, stlsq_path
 from latticebench.methods.method import Abilities, Fit
 from latticebench.systems.errors import InputError
@@ -135,14 +135,15 @@ def derivative_rows(
     reason: InputError | None = None
     for samples in data:
         try:
-            piece = rows([samples], library, order, kind, given)
+            own = list(row_pieces([samples], library, order, kind, given))
         except InputError as error:
             reason = error
             continue
-        # Rows are in the order of part, time, site.
-        length = len(piece.target) // (1 + samples.is_complex)
-        pieces.append(piece)
-        places.append(np.arange(len(piece.target)) % length / length)
+        for piece in own:
+            # Rows are in the order of part, time, site.
+            length = len(piece.target) // (1 + samples.is_complex)
+            pieces.append(piece)
+            places.append(np.arange(len(piece.target)) % max(length, 1) / max(length, 1))
     if not pieces:
         raise reason or InputError("there are no samples to fit")
     whole = Regression(

@@ -66,7 +66,7 @@ class Weak:
     @property
     def abilities(self) -> Abilities:
         """The method takes complex fields, inputs, uneven times and missing values."""
-        return Abilities(missing=True, loads=("scipy.interpolate", "scipy.linalg", "sympy", "pysindy"))
+        return Abilities(missing=True, memory=500, loads=("scipy.interpolate", "scipy.linalg", "sympy", "pysindy"))
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Estimate all coefficients, select terms, and estimate the coefficients of those again.

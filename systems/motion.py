@@ -129,7 +129,7 @@ class Motion:
 
     def _gather(self, slots: tuple[Slot, ...], some: slice) -> Callable[[float, ndarray], list[Any]]:
         """Return the function that cuts a state into the arrays that a compiled term takes at some of the sites."""
-        stencil, n = self._stencil, numbers(self.sites)[some]
+        stencil, n = self._stencil, numbers(self.sites, some)
         (left, _), count = self.term.reach, some.stop - some.start
         places: list[tuple[Any, ...]] = [
             () if one.name in ("t", "n") else (*one.place, slice(left + one.offset, left + one.offset + count))

@@ -75,9 +75,9 @@ def reach_of(terms: Sequence[Term]) -> tuple[int, int]:
     return max(term.reach[0] for term in terms), max(term.reach[1] for term in terms)
 
 
-def numbers(sites: int) -> Float[ndarray, " sites"]:
-    """Return the n of the term language at all sites of a chain."""
-    return np.arange(sites) - (sites - 1) / 2
+def numbers(sites: int, some: slice = slice(None)) -> Float[ndarray, " some"]:
+    """Return the n of the term language at some of the sites of a chain, by default at all."""
+    return np.arange(*some.indices(sites)) - (sites - 1) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +211,7 @@ class Stencil:
             else:
                 place = np.searchsorted(columns, read)
             ends = factor[some.start : some.stop + left + right]
-            yield Window(sites, columns, place, ends, numbers(self.shape[0])[sites])
+            yield Window(sites, columns, place, ends, numbers(self.shape[0], sites))
 
     @functools.cached_property
     def _windows(self) -> dict[Offset, tuple[Any, ...]]:
