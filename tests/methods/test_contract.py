@@ -14,7 +14,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from latticebench import methods, systems
 from latticebench.methods.engine.dynamics import split_parts
-from latticebench.methods.method import Abilities, Fit, Skipped, make, settings, solve
+from latticebench.methods.method import Abilities, Fit, Skipped, make, obstacle, settings, solve
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.samples import Samples, SimulatedSamples
@@ -290,3 +290,19 @@ def test_curves_that_a_method_gives_follow_the_samples_and_their_levels_are_deri
         inside = slice(len(lower) // 10, -len(lower) // 10)
         gone = CubicSpline(curves.times, upper).antiderivative()(curves.times)[inside]
         np.testing.assert_allclose(gone - gone[0], lower[inside] - lower[inside][0], atol=0.01 * np.max(np.abs(lower)))
+
+
+def test_a_method_that_the_memory_does_not_suffice_for_says_so_before_it_starts():
+    @dataclasses.dataclass(frozen=True)
+    class Hungry:
+        name = "hungry"
+        abilities = Abilities(memory=1e15)
+
+        def fit(self, data, library, order, seed):
+            raise AssertionError("it was started")
+
+    t = np.linspace(0, 1, 20)
+    data = [Samples(t, np.sin(t)[:, None] * np.ones(3))]
+    with pytest.raises(Skipped, match=r"1.1e\+08 GiB for 60 values and 2 terms.* piece by piece"):
+        solve(Hungry(), data, library("own", "u[n]; u[n]**3"), 2, 1)
+    assert "piece" not in obstacle(Abilities(memory=1.0), data, library("own", "u[n]"))

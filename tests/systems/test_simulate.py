@@ -1,6 +1,7 @@
 """Simulation: the order of each integrator, closed forms, conserved quantities, sampling and noise."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,18 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Initial, System
 from latticebench.systems.motion import motion
 from latticebench.systems.samples import Samples
-from latticebench.systems.simulate import follow, integrate, noise_size, observe, runge_kutta, sample_times, simulate
+from latticebench.systems.simulate import (
+    drift,
+    follow,
+    integrate,
+    noise_size,
+    observe,
+    runge_kutta,
+    sample_times,
+    simulate,
+)
+from latticebench.systems.stencil import evaluate
+from latticebench.systems.terms import Term, substitute
 
 ENDS = ("free", "fixed", "periodic", "antiperiodic")
 
@@ -304,6 +316,48 @@ def test_the_norm_of_the_ginzburg_landau_lattice_changes_as_its_balance_says(end
     change = np.sum(2 * np.real(np.conj(u) * rate), axis=1)
     balance = 2 * np.sum(np.abs(u) ** 2 - np.abs(u) ** 4, axis=1) - 2 * system.parameters["C"] * bond_sum(u, ends)
     np.testing.assert_allclose(change, balance, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("ends", ENDS)
+@pytest.mark.parametrize("name", ["phi4", "sine-gordon", "dnls"])
+def test_the_conserved_density_of_a_lattice_sums_to_its_energy_or_norm(name, ends):
+    samples, coupling = random_motion(name, ends, "dop853", 2.0)
+    system = systems.find(name)
+    density = Term(substitute(system.conserved, system.parameters))
+    found = np.sum(evaluate([density], samples.u, samples.v, None, samples.t, ends=ends)[0, 0], axis=1)
+    norm = np.sum(np.abs(samples.u) ** 2, axis=1)
+    wanted = norm if name == "dnls" else energy(name, samples.u, samples.v, coupling, ends)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    assert drift(system, {}, samples, ends) < 2e-11
+    faster = replace(samples, u=samples.u * np.where(samples.t > 1, 1.001, 1.0)[:, None])
+    assert drift(system, {}, faster, ends) > 1e-5
+
+
+def test_a_lattice_that_conserves_nothing_has_no_drift():
+    samples = simulate(systems.find("ginzburg-landau"), sites=9, times=np.array([0.0, 0.1]))
+    assert drift(systems.find("ginzburg-landau"), {}, samples) is None
+
+
+# Large lattices
+
+
+@pytest.mark.parametrize("ends", ENDS)
+@pytest.mark.parametrize("name", systems.names())
+def test_a_right_hand_side_in_parts_of_the_chain_is_that_of_the_whole_chain(monkeypatch, name, ends):
+    system = systems.find(name)
+    draw = np.random.default_rng(2)
+    whole = motion(system, {}, 23, ends)
+    y = draw.normal(size=system.order * whole.parts * 23)
+    wanted = whole.right_hand_side(0.3, y)
+    monkeypatch.setattr("latticebench.systems.motion.CACHED", 5)
+    np.testing.assert_allclose(motion(system, {}, 23, ends).right_hand_side(0.3, y), wanted, rtol=1e-14, atol=1e-14)
+
+
+def test_a_large_lattice_is_integrated_by_the_reference_unless_asked_otherwise():
+    system, times = systems.find("phi4"), np.array([0.0, 0.01, 0.02])
+    for sites, usual in ((1000, "rk4"), (1001, "dop853")):
+        found = simulate(system, sites=sites, times=times)
+        np.testing.assert_array_equal(found.u, simulate(system, sites=sites, times=times, integrator=usual).u)
 
 
 # Sampling
