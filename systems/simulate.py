@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 PAPER_STEP = 1e-3
 MAX_VALUES = 10**9
-# Sites up to which a system is integrated as its source does it; the reference is as exact and takes a tenth of the
-# time, and it alone needs time and memory in proportion to the sites.
+# Sites up to which a system is integrated as its source does it; the reference is as exact and takes fewer steps.
 MOST_AS_SOURCE = 1000
 # Evaluations that nobody would wait for, and after how many one looks whether it will come to them.
 HOPELESS, TRIED = 10**9, 10**5

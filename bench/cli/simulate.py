@@ -35,7 +35,8 @@ def simulate(
     ends: Annotated[KnownEnds | None, typer.Option(help="How the chain ends; the system's own if not given.")] = None,
     initial: Annotated[str | None, typer.Option(help="Initial state; the system's first if not given.")] = None,
     integrator: Annotated[
-        Literal["rk4", "bdf", "dop853"] | None, typer.Option(help="The system's own (the paper's) if not given.")
+        Literal["rk4", "bdf", "dop853"] | None,
+        typer.Option(help="The system's own (the paper's) if not given; of more than 1000 sites dop853."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise, gaps and uneven times.")] = 1,
     yes: Yes = False,
