@@ -113,6 +113,13 @@ def estimate(suite: Suite, cases: Iterable[Case], folder: Path, *, retry: bool =
     return Estimate(methods.reset_index(), sources)
 
 
+def seconds_of(suite: Suite, folder: Path) -> dict[str, float]:
+    """Return what cases of a suite took before, by their identities, as far as it is known; see `estimate`."""
+    times, _ = _recorded(suite.name, open_store(folder) if is_store(folder) else None)
+    found = {identity: times.get(_seedless(identity)) for identity in suite.by_identity}
+    return {identity: took.seconds for identity, took in found.items() if took is not None}
+
+
 def _finished(store: Store) -> dict[str, tuple[str, str]]:
     return {key: (status, case) for key, status, case in store.read('SELECT key, status, "case" FROM results')}
 

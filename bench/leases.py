@@ -48,7 +48,7 @@ class Leases:
         """
         with self.store.writing(durable=False) as cursor:
             held = cursor.execute("SELECT owner, until FROM leases WHERE key = ?", (key,)).fetchone()
-            if held is not None and held[0] != self.owner and _lasts(held[1]) and not _gone(held[0]):
+            if held is not None and held[0] != self.owner and _lasts(held[1]) and not is_gone(held[0]):
                 return False
             cursor.execute("INSERT OR REPLACE INTO leases VALUES (?, ?, ?)", (key, self.owner, time.time() + LASTS))
         return True
@@ -71,7 +71,7 @@ def _lasts(until: object) -> bool:
     return isinstance(until, (int, float)) and 0 < until - time.time() < 2 * LASTS
 
 
-def _gone(owner: str) -> bool:
+def is_gone(owner: str) -> bool:
     """Return whether the process of an owner has ended, as far as one can know: that of another machine has not."""
     node, _, rest = str(owner).rpartition(" ")[0].partition(" ")
     number, _, started = rest.partition(" ")

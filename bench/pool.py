@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from queue import Empty, SimpleQueue
+from types import TracebackType
 from typing import Any, Literal
 
 from latticebench.bench.case import Case, Folders, code_file
@@ -37,34 +38,10 @@ def execute(
     keep: Callable[[Case, dict[str, Any]], None],
     pulse: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run cases on `jobs` workers.
-
-    A case beyond its time or memory limit has its worker ended; its result says so. On any exception (Ctrl-C among
-    them) all workers are ended before it is passed on.
-
-    Args:
-        cases: in the order in which they begin, but for those with code of the user's, which come last.
-        folders: where relative paths start from.
-        jobs: worker processes.
-        begin: is asked as a case is about to begin.
-        keep: takes each result as soon as it is there.
-        pulse: is called about every POLL seconds.
-    """
-    # A worker is then started anew for each such code once, not at every second case.
-    queue = deque((case, 1) for case in sorted(cases, key=foreign))
-    with Guardian() as guardian:
-        pool = _Pool(max(1, min(jobs, len(queue))), folders, guardian)
-        try:
-            while queue or pool.later or pool.busy:
-                pool.begin(queue, begin)
-                for case, number, result in pool.results():
-                    if result["status"] == "died" and number < TRIES:
-                        queue.appendleft((case, number + 1))
-                    else:
-                        keep(case, result)
-                pulse()
-        finally:
-            pool.close()
+    """Run cases on `jobs` workers, which end with the last case; see `Pool.run`."""
+    waiting = list(cases)
+    with Pool(max(1, min(jobs, len(waiting)))) as pool:
+        pool.run(waiting, folders, begin=begin, keep=keep, pulse=pulse)
 
 
 def foreign(case: Case) -> str:
@@ -73,22 +50,68 @@ def foreign(case: Case) -> str:
     return "\n".join(path for name in (roots.method, roots.system) if (path := code_file(name)) is not None)
 
 
-class _Pool:
-    """The workers, and the cases that they are on with the number of the try."""
+class Pool:
+    """Workers that live on from one run of cases to the next; a context that ends them."""
 
-    def __init__(self, size: int, folders: Folders, guardian: Guardian) -> None:
+    def __init__(self, size: int) -> None:
         self.events: Events = SimpleQueue()
-        self.folders, self.guardian = folders, guardian
+        self.folders, self.guardian = Folders(), Guardian()
         self.workers: list[Process | None] = [None] * size
+        # Of the workers that are on a case, the number of its try.
         self.tries: dict[Process, int] = {}
         self.later: deque[tuple[float, tuple[Case, int]]] = deque()
         self.looked = 0.0
 
-    @property
-    def busy(self) -> bool:
-        return bool(self.tries)
+    def __enter__(self) -> Pool:
+        """Start what ends the workers should this process be killed; they start when there is work."""
+        self.guardian.__enter__()
+        return self
 
-    def begin(self, queue: deque[tuple[Case, int]], ask: Callable[[Case], Turn]) -> None:
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
+        """End the workers."""
+        try:
+            self._close()
+        finally:
+            self.guardian.__exit__(kind, value, at)
+
+    def run(
+        self,
+        cases: Iterable[Case],
+        folders: Folders,
+        *,
+        begin: Callable[[Case], Turn],
+        keep: Callable[[Case, dict[str, Any]], None],
+        pulse: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Run cases.
+
+        A case beyond its time or memory limit has its worker ended; its result says so. On any exception (Ctrl-C among
+        them) all workers are ended before it is passed on.
+
+        Args:
+            cases: in the order in which they begin, but for those with code of the user's, which come last.
+            folders: where relative paths start from.
+            begin: is asked as a case is about to begin.
+            keep: takes each result as soon as it is there.
+            pulse: is called about every POLL seconds.
+        """
+        # A worker is then started anew for each such code once, not at every second case.
+        queue = deque((case, 1) for case in sorted(cases, key=foreign))
+        self.folders = folders
+        try:
+            while queue or self.later or self.tries:
+                self._begin(queue, begin)
+                for case, number, result in self._results():
+                    if result["status"] == "died" and number < TRIES:
+                        queue.appendleft((case, number + 1))
+                    else:
+                        keep(case, result)
+                pulse()
+        except BaseException:
+            self._close()
+            raise
+
+    def _begin(self, queue: deque[tuple[Case, int]], ask: Callable[[Case], Turn]) -> None:
         """Give each worker that waits a case."""
         while self.later and self.later[0][0] <= time.monotonic():
             queue.append(self.later.popleft()[1])
@@ -114,7 +137,7 @@ class _Pool:
         worker.start(case, self.folders)
         self.tries[worker] = number
 
-    def results(self) -> list[tuple[Case, int, dict[str, Any]]]:
+    def _results(self) -> list[tuple[Case, int, dict[str, Any]]]:
         """Wait a moment, and return what has ended: the case, the number of the try, and the result."""
         found = []
         try:
@@ -131,7 +154,10 @@ class _Pool:
             if case is not None and result is not None
         ]
 
-    def close(self) -> None:
+    def _close(self) -> None:
         for worker in self.workers:
             if worker is not None:
                 worker.close()
+        self.workers = [None] * len(self.workers)
+        self.tries.clear()
+        self.later.clear()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -96,7 +96,7 @@ class Bar:
         self.progress.update(self.task, running="   ".join(self.running[:3]))
 
 
-def wrong(case: Case, result: dict[str, Any]) -> str:
+def wrong(case: Case, result: Mapping[str, Any]) -> str:
     """Return in one line what went wrong with a case."""
     reason = f": {result['reason']}" if result["reason"] else ""
     return printable(f"{result['status']}: {case.title}{reason}")

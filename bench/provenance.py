@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -93,20 +94,21 @@ def commit() -> str:
     return head + ("+changes" if changed else "")
 
 
+def processor() -> str:
+    """Return the name of the processor."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
 def machine() -> str:
     """Describe the machine without naming it: processor, cores, memory, system."""
     import psutil
 
-    processor = platform.processor() or platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                processor = line.split(":", 1)[1].strip()
-                break
-    except OSError:
-        pass
     memory = round(psutil.virtual_memory().total / 2**30)
-    return f"{processor}, {os.cpu_count()} cores, {memory} GiB, {platform.system()} {platform.machine()}"
+    return f"{processor()}, {os.cpu_count()} cores, {memory} GiB, {platform.system()} {platform.machine()}"
 
 
 def kernels(loads: Collection[str] = ()) -> str:

@@ -1,19 +1,22 @@
-"""The runner: the cases of a suite that have no result yet, on a pool of worker processes, each result kept at once."""
+"""The runner: the cases of a suite that have no result yet, by whatever executor, each result kept at once."""
 
 from __future__ import annotations
 
 import itertools
 import json
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from latticebench import methods
 from latticebench.bench import source
 from latticebench.bench.case import Case
+from latticebench.bench.executors.executor import Executor
+from latticebench.bench.executors.local import Local
 from latticebench.bench.leases import Leases
-from latticebench.bench.pool import Turn, execute
-from latticebench.bench.provenance import origin
+from latticebench.bench.pool import Turn
+from latticebench.bench.presence import Presence
 from latticebench.bench.store import WHOLE, Results, Shard, Store
 from latticebench.bench.suite import Suite
 from latticebench.methods.method import make
@@ -48,7 +51,8 @@ def run(
     suite: Suite,
     store: Store,
     *,
-    jobs: int,
+    jobs: int = 1,
+    executor: Executor | None = None,
     retry: bool = False,
     shard: Shard = WHOLE,
     watcher: Watcher | None = None,
@@ -59,7 +63,8 @@ def run(
     Args:
         suite: what to run.
         store: where results are kept; one that is there is used again.
-        jobs: worker processes.
+        jobs: worker processes of this machine.
+        executor: what runs the cases instead of them.
         retry: run failed cases again.
         shard: the part of the suite to run.
         watcher: is told of every case.
@@ -69,32 +74,26 @@ def run(
         the results of the shard in the order of the suite, and what was done.
 
     Raises:
-        InputError: a result cannot be written.
+        InputError: a result cannot be written, or the executor cannot work.
         KeyboardInterrupt: the user stopped the run; finished cases are in the store.
     """
     keys = source.keys(suite.by_identity, suite.folders)
     store.plan(keys, about or {})
-    made = origin(_loads(suite))
     before = store.finished()
     wanted = dict(itertools.islice(zip(keys.values(), suite.cases, strict=True), shard.first - 1, None, shard.step))
     waiting = [case for key, case in wanted.items() if key not in before or not counts(case, *before[key], retry)]
     tally = Tally(reused=len(wanted) - len(waiting))
     if watcher is not None:
         watcher.count(len(waiting))
-
-    def keep(case: Case, result: dict[str, Any]) -> None:
-        store.put(keys[case.identity], case, result, made)
-        tally.ran += 1
-        if watcher is not None:
-            watcher.finished(case, result)
-
     if waiting:
         leases = Leases(store)
-        turns = _Turns(store, leases, keys, before, retry, tally, watcher)
+        presence = Presence(store, leases.owner, left=len(waiting))
+        ledger = _Ledger(store, leases, presence, keys, before, retry, tally, watcher)
         try:
-            execute(waiting, suite.folders, jobs=jobs, begin=turns.turn, keep=keep, pulse=leases.renew)
+            (executor or Local(jobs)).execute(waiting, suite.folders, _loads(suite), ledger)
         finally:
             leases.give_back()
+            presence.leave()
     store.forget_replaced()
     store.relabel(_renamed(wanted, store.finished() if waiting else before))
     tally.statuses = store.statuses(shard)
@@ -102,18 +101,20 @@ def run(
 
 
 @dataclass(frozen=True)
-class _Turns:
-    """What decides whether a case is run now: its lease, and whether another run has finished it in the meantime."""
+class _Ledger:
+    """What an executor asks and tells; see `bench.executors.executor.Ledger`."""
 
     store: Store
     leases: Leases
+    presence: Presence
     keys: Mapping[str, str]
     before: Mapping[str, tuple[str, str]]
     retry: bool
     tally: Tally
     watcher: Watcher | None
 
-    def turn(self, case: Case) -> Turn:
+    def begin(self, case: Case, where: str = "") -> Turn:
+        """Take the lease of a case, and say whether another run has it, or has finished it in the meantime."""
         key = self.keys[case.identity]
         if not self.leases.take(key):
             return "later"
@@ -121,12 +122,31 @@ class _Turns:
             if counts(case, *found, self.retry) or self.before.get(key) != found:
                 self.leases.give_back(key)
                 self.tally.reused += 1
+                self.presence.found()
                 if self.watcher is not None:
                     self.watcher.found()
                 return "done"
+        self.presence.started(case, where)
         if self.watcher is not None:
             self.watcher.started(case)
         return "run"
+
+    def keep(self, case: Case, result: dict[str, Any], made: Mapping[str, Any]) -> None:
+        """Keep a result; its lease ends with it."""
+        self.store.put(self.keys[case.identity], case, result, made)
+        self.tally.ran += 1
+        self.presence.finished(case, result)
+        if self.watcher is not None:
+            self.watcher.finished(case, result)
+
+    def pulse(self) -> None:
+        """Renew the leases, and tell other shells how far the run is."""
+        self.leases.renew()
+        self.presence.tell()
+
+    def together(self) -> AbstractContextManager[object]:
+        """Write all that the block does at once."""
+        return self.store.writing()
 
 
 def _renamed(cases: Mapping[str, Case], finished: Mapping[str, tuple[str, str]]) -> dict[str, Case]:

@@ -5,6 +5,7 @@
     suite    the keys of the suite that was run last, in their order
     about    what else was written down of that run: command, settings
     leases   which run is on which case, see `bench.leases`
+    runs     how far each run is that is on this store now, see `bench.presence`
 
 Each result is committed at once, in a transaction of its own, so that a killed run loses nothing that it had
 reported, and two runs at once harm nothing. The history of a fit, which is most of a result, is read only where it is
@@ -46,6 +47,7 @@ CREATE INDEX IF NOT EXISTS by_key ON results (key, kind, status, seed, origin);
 CREATE TABLE IF NOT EXISTS suite (place INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE);
 CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS leases (key TEXT PRIMARY KEY, owner TEXT NOT NULL, until REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS runs (owner TEXT PRIMARY KEY, until REAL NOT NULL, content TEXT NOT NULL);
 """
 # What reading or writing a file of SQLite raises; a text in it that is not UTF-8 is no error of its own.
 FAILURES = (sqlite3.Error, UnicodeError)
@@ -232,7 +234,7 @@ class Store:
 
     @contextmanager
     def writing(self, *, durable: bool = True) -> Iterator[sqlite3.Cursor]:
-        """Write all that the block does, or nothing.
+        """Write all that the block does, or nothing; what is written inside belongs to it.
 
         Args:
             durable: wait until it is on the disk; what is not may be lost when the machine, not when the run, fails.
@@ -241,6 +243,9 @@ class Store:
             InputError: it cannot be written, or is damaged.
         """
         try:
+            if self.connection.in_transaction:
+                yield self.connection.cursor()
+                return
             if not durable:
                 self.connection.execute("PRAGMA synchronous = NORMAL")
             with self.connection:
@@ -378,7 +383,8 @@ def _is_file(path: Path) -> bool:
 def _connect(path: Path, mode: str, *, fresh: bool = False) -> sqlite3.Connection:
     """Open a file, and make sure that it is a store of this version or, where it may be fresh, has nothing in it."""
     uri = f"{path.resolve().as_uri()}?mode={mode}"
-    connection = sqlite3.connect(uri, uri=True, timeout=PATIENCE, isolation_level=None)
+    # The collector of garbage, which may be at work in any thread, closes it.
+    connection = sqlite3.connect(uri, uri=True, timeout=PATIENCE, isolation_level=None, check_same_thread=False)
     try:
         # The file may be anybody's: what its schema calls must be harmless.
         connection.execute("PRAGMA trusted_schema = OFF")

@@ -1,6 +1,7 @@
 """Suites: named lists of cases, written in TOML.
 
     title = "what it is for"
+    timing = true                   # run times are compared: workers of one kind of processor; false if not given
 
     [methods.stlsq]                 # a label; any number of variants of one method
     method = "stlsq"                # a name, or FILE.py of a user's own
@@ -70,6 +71,7 @@ Label = Annotated[str, pydantic.StringConstraints(pattern=r"\S", max_length=200)
 
 class _File(Settings):
     title: str = ""
+    timing: bool = False
     methods: dict[Label, Contestant] = {}
     defaults: dict[str, Any] = {}
     grid: list[dict[str, Any]] = []
@@ -88,6 +90,7 @@ class Suite:
         by_identity: the cases by their identities, in the order in which they run.
         folders: where relative paths in cases start from.
         contestants: methods and their settings by their labels.
+        timing: whether their run times are compared.
     """
 
     name: str
@@ -95,6 +98,7 @@ class Suite:
     by_identity: Mapping[str, Case]
     folders: Folders
     contestants: Mapping[str, Contestant]
+    timing: bool = False
 
     @property
     def cases(self) -> tuple[Case, ...]:
@@ -167,7 +171,7 @@ def load(name: str, data: Path = DATA, *, large: bool = False, choice: Choice = 
                     check_size(case, getattr(case, "sites", 1), case.title)
     except InputError as error:
         raise InputError(f"{shown}: {error}") from None
-    return Suite(path.stem, file.title, cases, folders, contestants)
+    return Suite(path.stem, file.title, cases, folders, contestants, file.timing)
 
 
 def _check_choice(choice: Choice, file: _File, shown: str) -> None:

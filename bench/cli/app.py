@@ -33,6 +33,7 @@ from latticebench.bench.cli import (
     run,
     schema,
     simulate,
+    status,
     table,
 )
 from latticebench.bench.threads import prefer_one_thread
@@ -82,6 +83,7 @@ app.command(epilog=diagnose.EPILOG)(diagnose.diagnose)
 app.command(epilog=demo.EPILOG)(demo.demo)
 app.add_typer(data.app, name="data")
 app.command(epilog=run.EPILOG)(run.run)
+app.command(epilog=status.EPILOG)(status.status)
 app.command(epilog=merge.EPILOG)(merge.merge)
 app.command(epilog=table.EPILOG)(table.table)
 app.command(epilog=figures.EPILOG)(figures.figures)

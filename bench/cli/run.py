@@ -6,9 +6,10 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -19,6 +20,8 @@ from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
     from latticebench.bench.case import Case
+    from latticebench.bench.executors.cluster import Place
+    from latticebench.bench.executors.executor import Executor
     from latticebench.bench.store import Shard, Store
     from latticebench.bench.suite import Suite
 
@@ -33,6 +36,19 @@ def run(
         str, typer.Argument(help="A name from `list suites`, or a .toml file.", autocompletion=complete_suites)
     ],
     jobs: Jobs = None,
+    executor: Annotated[
+        Literal["local", "dask"], typer.Option(help="Run cases in processes of this machine, or on workers of Dask's.")
+    ] = "local",
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="With dask: a scheduler that runs; tls://, too.")
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(metavar="local:N|FILE.toml", help="With dask: N workers here, or jobs of a batch system."),
+    ] = None,
+    any_processor: Annotated[
+        bool, typer.Option("--any-processor", help="With dask: take unlike processors even for a suite that is timed.")
+    ] = False,
     results: Annotated[
         Path | None, typer.Option(parser=place, metavar="DIR", help="Where results are kept; runs/SUITE if not given.")
     ] = None,
@@ -61,20 +77,27 @@ def run(
     choice = chosen(only, methods, seeds)
     loaded = load(suite, data, large=yes, choice=choice)
     part = shard_of(shard, len(loaded.cases))
-    jobs = jobs or os.cpu_count() or 1
+    where = _place(executor, scheduler, cluster, any_processor, jobs)
+    jobs = (jobs or os.cpu_count() or 1) if where is None else where.workers
     folder = results if results is not None else Path("runs") / loaded.name
     if dry_run:
         _tell_estimate(loaded, part, jobs, folder, retry, as_json)
         return
     _tell_hours(suite, loaded.cases[part.first - 1 :: part.step], jobs, yes)
     store = create(folder)
-    about = {"command": command_line(), "suite": loaded.name, "jobs": jobs, "chosen": str(choice)}
+    about: dict[str, Any] = {"command": command_line(), "suite": loaded.name, "chosen": str(choice)}
     about |= {"settings": _contestants(loaded)} if loaded.contestants else {}
     # A cluster that ends a job says so first; that is the same as Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with progress_of(len(loaded.cases[part.first - 1 :: part.step])) as watcher:
-            _, tally = run_suite(loaded, store, jobs=jobs, retry=retry, shard=part, watcher=watcher, about=about)
+        with (
+            _executor(where, loaded, folder, jobs, any_processor) as chosen_one,
+            progress_of(len(loaded.cases[part.first - 1 :: part.step])) as watcher,
+        ):
+            _, tally = run_suite(
+                loaded, store, executor=chosen_one, retry=retry, shard=part, watcher=watcher,
+                about={**about, **chosen_one.about},
+            )  # fmt: skip
     except KeyboardInterrupt:
         print(
             f"stopped; {len(store.results())} results are in {shown(folder)}; the same command continues from there",
@@ -83,11 +106,56 @@ def run(
         raise
     title = loaded.title
     # What is shown is read from the store; a hundred thousand cases need not be held beside it.
-    del loaded, watcher
+    del loaded, watcher, chosen_one
     if as_json:
         print(document(store, part), end="")
     else:
         _show(store, title, part, f"{tally.ran} run now, {tally.reused} were there; kept in {shown(folder)}")
+
+
+def _place(
+    executor: str, scheduler: str | None, cluster: str | None, any_processor: bool, jobs: int | None
+) -> Place | None:
+    """Return where the workers of Dask's are; None for processes of this machine.
+
+    Raises:
+        InputError: the options do not go together, or Dask is not installed.
+    """
+    if executor == "local":
+        for name, given in (("scheduler", scheduler), ("cluster", cluster), ("any-processor", any_processor)):
+            if given:
+                raise InputError(f"--{name}: goes with --executor dask")
+        return None
+    from latticebench.bench.executors.cluster import check_installed, place_of
+
+    if jobs is not None:
+        raise InputError("--jobs: the workers of --executor dask are those of --scheduler or --cluster")
+    check_installed()
+    return place_of(scheduler, cluster)
+
+
+@contextmanager
+def _executor(where: Place | None, suite: Suite, folder: Path, jobs: int, any_processor: bool) -> Iterator[Executor]:
+    """Return what runs the cases; what it has started ends after the block."""
+    if where is None:
+        from latticebench.bench.executors.local import Local
+
+        yield Local(jobs)
+        return
+    from latticebench.bench.estimate import seconds_of
+    from latticebench.bench.executors.cluster import is_open
+    from latticebench.bench.executors.dask import Dask
+
+    with where.connected() as connection:
+        if is_open(connection.address):
+            print(
+                f"warning: the scheduler at {connection.address} takes code from all who reach it; use tls:// "
+                "(see docs/cluster.md)",
+                file=sys.stderr,
+            )
+        if connection.dashboard:
+            print(f"dashboard: {connection.dashboard}", file=sys.stderr)
+        yield Dask(connection, suite.timing and not any_processor, seconds_of(suite, folder))
 
 
 def _show(store: Store, title: str, part: Shard, told: str) -> None:

@@ -81,7 +81,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
             if asked["begin"](case) == "run":
                 asked["keep"](case, attempt(case, folders))
 
-    monkeypatch.setattr("latticebench.bench.run.execute", execute)
+    monkeypatch.setattr("latticebench.bench.executors.local.execute", execute)
 
 
 def fits(suite: Suite) -> Counter[tuple[str, str]]:
