@@ -84,8 +84,9 @@ class Batches:
         most, left, batch = math.ceil(len(self._queue) / (2 * max(workers, 1))), self.budget, list[Case]()
         while self._queue and len(batch) < most and left > 0:
             case = self._queue[0]
-            lost = self._losses[id(case)] > 0
-            if batch and (lost or foreign(case) != foreign(batch[0])):
+            # One of which nothing is known goes alone, and so does one that has been lost with a worker.
+            guess = math.inf if self._losses[id(case)] else self._guess(case)
+            if batch and (math.isinf(guess) or foreign(case) != foreign(batch[0])):
                 break
             self._queue.popleft()
             turn = ask(case)
@@ -95,8 +96,7 @@ class Batches:
                 self.open -= 1
             else:
                 batch.append(case)
-                # One of which nothing is known goes alone, and so does one that has been lost with a worker.
-                left = 0.0 if lost else left - self._guess(case)
+                left -= guess
         return batch
 
     def _guess(self, case: Case) -> float:

@@ -9,10 +9,11 @@ A cluster file is TOML:
     memory = "4GiB"
     walltime = "02:00:00"     # of a job, hours:minutes:seconds
     margin = 120              # seconds before its end when it gives its case back
-    account = "physics"       # these four may be left out
+    account = "physics"       # this and what follows may be left out
     interface = "ib0"
     prologue = ["module load python"]
     directives = ["--constraint=avx2"]
+    logs = "jobs"             # a folder for what jobs print; the batch system's own choice if not given
     python = "/home/me/env/bin/python"   # at the workers; this one if not given
 """
 
@@ -80,6 +81,7 @@ class Jobs(Settings):
     interface: str | None = None
     prologue: tuple[str, ...] = ()
     directives: tuple[str, ...] = ()
+    logs: str | None = None
     python: str | None = None
 
     @pydantic.model_validator(mode="after")
@@ -210,7 +212,7 @@ def _batch_system(jobs: Jobs) -> Any:
     import dask_jobqueue
 
     name = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "lsf": "LSFCluster", "sge": "SGECluster"}[jobs.system]
-    given = {"queue": jobs.queue, "account": jobs.account, "interface": jobs.interface}
+    given = {"queue": jobs.queue, "account": jobs.account, "interface": jobs.interface, "log_directory": jobs.logs}
     options = {
         "cores": jobs.cores,
         "processes": jobs.cores,

@@ -65,6 +65,13 @@ def test_a_batch_is_as_long_as_makes_its_messages_two_per_cent_of_it() -> None:
         assert batches.budget == pytest.approx(min(overhead / SHARE, LONGEST), rel=0.01)
 
 
+def test_a_case_of_unknown_length_keeps_no_other_waiting() -> None:
+    batches = Batches.of([case(1), case(2), case(3, label="b"), case(4), case(5)], {})
+    batches.overhead = 1.0
+    batches.done(case(), 0.001)
+    assert [seeds(batches.take(1, lambda _: "run")) for _ in range(4)] == [[1, 2], [3], [4], [5]]  # type: ignore[arg-type]
+
+
 def test_batches_shrink_at_the_end_and_every_case_is_in_one() -> None:
     batches = Batches.of([case(seed) for seed in range(1000)], {})
     batches.done(case(), 0.001)
