@@ -196,6 +196,7 @@ def _cluster(place: Place) -> Any:
         return LocalCluster(
             n_workers=place.local, threads_per_worker=1, memory_limit=0, host="127.0.0.1", dashboard_address=":0",
             silence_logs=logging.CRITICAL,
+            preload=["latticebench.bench.executors.station"],
         )  # fmt: skip
     return _batch_system(place.jobs)
 

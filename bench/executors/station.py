@@ -8,6 +8,7 @@ is bytes and plain values, which a scheduler can pass on without it.
 from __future__ import annotations
 
 import pickle
+import signal
 import tempfile
 import threading
 import time
@@ -144,6 +145,11 @@ def work(parcel: bytes, batch: bytes, budget: float) -> dict[str, Any]:
 def close() -> None:
     """End the process; the next batch starts another."""
     _STATION.close()
+
+
+def dask_setup(worker: object) -> None:  # noqa: ARG001
+    """Leave Ctrl-C to the client that has started this worker; Dask calls this where the module is preloaded."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _asker() -> Callable[[], bool]:

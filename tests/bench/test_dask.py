@@ -38,11 +38,9 @@ KILLS = 8
 # Columns that differ from run to run.
 TIMES = ("seconds", "cpu_seconds", "peak_mib")
 
-SUITE = """
-title = "hostile"
-timing = true
-{methods}
+GRID = """
 [[grid]]
+methods = ["{label}"]
 system = "phi4"
 sites = 5
 samples = 8
@@ -54,16 +52,17 @@ time_limit = 3600
 """
 
 
-def written(folder: Path, methods: dict[str, str], *, noise: str = "0.0", seeds: str = "[1]") -> Path:
-    """Write a suite with one entry per method, its label and its settings; names are of this package."""
+def written(folder: Path, methods: dict[str, str], *, noise: str = "[0.0]", seeds: str = "[1]") -> Path:
+    """Write a suite of hostile methods by their labels and settings, or of one of this package by its name."""
     folder.mkdir(exist_ok=True)
     shutil.copy(HERE / "hostile.py", folder / "hostile.py")
-    entries = [
-        f'[methods."{label}"]\n' + (f'method = "hostile.py"\nsettings = {{ {text} }}\n' if "=" in text or not text
-                                    else f'method = "{text}"\n')
-        for label, text in methods.items()
-    ]  # fmt: skip
-    (folder / "hostile.toml").write_text(SUITE.format(methods="\n".join(entries), noise=noise, seeds=seeds))
+    text = 'title = "hostile"\ntiming = true\n'
+    for label, given in methods.items():
+        own = not given or "=" in given
+        text += f'[methods."{label}"]\nmethod = "{"hostile.py" if own else given}"\n'
+        text += f"settings = {{ {given} }}\n" if own else ""
+    text += "".join(GRID.format(label=label, noise=noise, seeds=seeds) for label in methods)
+    (folder / "hostile.toml").write_text(text)
     return folder / "hostile.toml"
 
 
@@ -235,7 +234,7 @@ def test_after_the_client_has_ended_nothing_is_left_over_and_it_goes_on(
     _, err = runner.communicate(timeout=PATIENCE)
     wait_for(lambda: gone(processes))
     if how == signal.SIGINT:
-        assert (runner.returncode, b"Traceback" in err) == (130, False)
+        assert (runner.returncode, b"Traceback" in err) == (130, False), err.decode()
         assert b"the same command continues" in err
     gate.touch()
     again = start(RUN, *asked(path, store, "--cluster", "local:1"))
