@@ -87,6 +87,8 @@ class Choice:
             contestants: labels that are run, see `contestants`.
         """
         block = self.with_seeds(content)
+        if self.methods and isinstance(block.get("seeds_of"), dict):
+            block["seeds_of"] = {label: seeds for label, seeds in block["seeds_of"].items() if label in contestants}
         had = content.get("methods", list(own))
         if not self.methods or not isinstance(had, list):
             return block
@@ -95,7 +97,9 @@ class Choice:
 
     def with_seeds(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Return a block of any kind with the seeds that are run."""
-        return {**content, "seeds": list(self.seeds)} if self.seeds else {**content}
+        if not self.seeds:
+            return {**content}
+        return {**{key: value for key, value in content.items() if key != "seeds_of"}, "seeds": list(self.seeds)}
 
 
 def chosen(

@@ -26,7 +26,10 @@ class Contestant(Settings):
 
 
 class Grid(Settings):
-    """A block of a suite: every list is an axis. The keys are those of `FitCase`, some of them in the plural."""
+    """A block of a suite: every list is an axis. The keys are those of `FitCase`, some of them in the plural.
+
+    `seeds_of` has the seeds of single methods, by their labels, in place of `seeds`.
+    """
 
     part: str = ""
     system: str
@@ -47,15 +50,17 @@ class Grid(Settings):
     missing: Listed[float] = [0.0]
     mirror: Listed[bool] = [False]
     seeds: Seeds = [1]
+    seeds_of: dict[str, Seeds] = {}
     methods: list[str] | None = None
     time_limit: float = 120.0
     memory_limit: int = 4096
 
     def count(self, contestants: Mapping[str, Contestant]) -> int:
         """Return the number of combinations; the arguments are those of `cases`."""
-        axes = [*self.parameters.values(), *(getattr(self, axis) for axis in AXES), self.seeds]
+        axes = [*self.parameters.values(), *(getattr(self, axis) for axis in AXES)]
         labels = list(contestants) if self.methods is None else self.methods
-        return math.prod([len(axis) for axis in axes]) * len(labels) * (len(self.libraries) + len(self.terms))
+        fits = sum(len(self.seeds_of.get(label, self.seeds)) for label in labels)
+        return math.prod([len(axis) for axis in axes]) * fits * (len(self.libraries) + len(self.terms))
 
     def cases(self, contestants: Mapping[str, Contestant], where: str) -> Iterator[FitCase]:
         """Return every combination.
@@ -70,7 +75,7 @@ class Grid(Settings):
         if not contestants:
             raise InputError(f"{where}: the suite names no methods; write at least one [methods.LABEL]")
         labels = list(contestants) if self.methods is None else self.methods
-        for label in labels:
+        for label in (*labels, *self.seeds_of):
             if label not in contestants:
                 raise unknown("method", label, contestants, where)
         if not labels:
@@ -81,6 +86,8 @@ class Grid(Settings):
             (name, tuple(terms)) for name, terms in self.terms.items()
         ]
         parameter_names = list(self.parameters)
+        drawn = {label: self.seeds_of.get(label, self.seeds) for label in labels}
+        seeds = list(dict.fromkeys(itertools.chain(*drawn.values())))
         # Data outermost, methods innermost: a worker that has simulated a trajectory uses it for every method.
         for parameters in itertools.product(*self.parameters.values()):
             for axes in itertools.product(*(getattr(self, axis) for axis in AXES)):
@@ -94,5 +101,6 @@ class Grid(Settings):
                     for (name, terms), label in itertools.product(libraries, labels)
                 ]  # fmt: skip
                 # The seeds have been checked.
-                for seed, case in itertools.product(self.seeds, first):
-                    yield case.model_copy(update={"seed": seed})
+                for seed, case in itertools.product(seeds, first):
+                    if seed in drawn[case.label]:
+                        yield case.model_copy(update={"seed": seed})

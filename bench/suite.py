@@ -15,6 +15,7 @@
     system = "phi4"                 # a name, or FILE.py / FILE.toml
     parameters = { C = [0.5, 2.0] }
     libraries = ["lib1", "lib2"]
+    seeds_of = { pinn = "1-5" }     # of single methods, in place of seeds
 
     [[made]]                        # diagnoses of recordings made with a known effect: every combination of the lists
     effects = ["catalogue", "none"] # see `bench.trials.trial.Made`
