@@ -254,7 +254,7 @@ def test_an_estimate_counts_what_is_finished_and_takes_published_times(here: Non
     run(load("tiny", choice=chosen(["phi4 | *"])), create(tmp_path / "tiny"), jobs=1)
     found = estimate(suite, suite.cases, tmp_path / "tiny")
     assert found.there == sum(case.title.startswith("phi4 |") for case in suite.cases)
-    paper = load("paper", choice=chosen(["1a"], ["pinn"]))
+    paper = load("paper", choice=chosen(["1a"], ["pinn"], "1"))
     published = estimate(paper, paper.cases, tmp_path / "none")
     assert (published.known, published.sources) == (1, ("results/paper",))
     assert published.seconds(1) > 1

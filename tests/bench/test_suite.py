@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from latticebench.bench.case import Case
+from latticebench.bench.choice import Choice
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.source import keys
 from latticebench.bench.suite import Suite, load, names
@@ -148,6 +149,29 @@ def test_a_range_of_seeds_is_the_list_of_them(tmp_path: Path) -> None:
 def test_what_is_no_range_of_seeds_is_refused_with_its_place(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError, match=r"seeds.*1-100"):
         load(write(tmp_path, SUITE.replace("seeds = [1, 2]", f'seeds = "{text}"')))
+
+
+def drawn(suite: Suite) -> dict[str, list[int]]:
+    found: dict[str, set[int]] = {}
+    for case in suite.cases:
+        assert isinstance(case, FitCase)
+        found.setdefault(case.label, set()).add(case.seed)
+    return {label: sorted(seeds) for label, seeds in found.items()}
+
+
+def test_a_method_has_the_seeds_that_a_block_gives_it_and_the_others_those_of_the_block(tmp_path: Path) -> None:
+    file = write(tmp_path, SUITE + 'seeds_of = { floor = "2-4" }\n')
+    assert drawn(load(file)) == {"floor": [2, 3, 4], "dense": [1, 2]}
+    # Eight kinds of data and libraries.
+    assert len(load(file).cases) == 8 * (3 + 2)
+    assert drawn(load(file, choice=Choice(seeds=(7,)))) == {"floor": [7], "dense": [7]}
+    assert drawn(load(file, choice=Choice(methods=("dense",)))) == {"dense": [1, 2]}
+    assert drawn(load(file, choice=Choice(methods=("floor",)))) == {"floor": [2, 3, 4]}
+
+
+def test_seeds_of_a_method_that_is_not_in_the_suite_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unknown method 'flor'; did you mean 'floor'"):
+        load(write(tmp_path, SUITE + 'seeds_of = { flor = "2-4" }\n'))
 
 
 def test_the_key_of_a_case_does_not_depend_on_its_label_or_limits(tmp_path: Path) -> None:
