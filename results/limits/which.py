@@ -22,6 +22,7 @@ import pandas as pd
 
 from latticebench.bench.publish import render
 from latticebench.bench.tables import read_cases, summary
+from latticebench.methods import RENAMED
 from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent
@@ -36,7 +37,7 @@ CONTESTANTS = (
     "trajectory-select",
     "splines",
     "weak",
-    "pinn-vp",
+    "pielm",
     "sindy-tuned",
     "stlsq",
     "stlsq-differences",
@@ -51,6 +52,7 @@ COMPARED = 0.01
 def load(path: Path) -> pd.DataFrame:
     """Read the cases and add columns for samples, sites, system, the lattice's own library and lost fits."""
     table = read_cases(path)
+    table["method"] = table["method"].replace(RENAMED)
     settings = [json.loads(text) for text in table["identity"]]
     for name, value in BASE.items():
         table[name] = [one.get(name, value) for one in settings]
@@ -193,10 +195,10 @@ def own_terms(table: pd.DataFrame) -> str:
         [
             "## The lattice's own terms\n",
             "Efficiency with 50 samples of 31 sites; 1 is the best that an unbiased method can reach. Over ten seeds "
-            f"(three for `pinn-vp`) an efficiency scatters by about {scattered:.0f} %. A seed draws the same noise at "
+            f"(three for `pielm`) an efficiency scatters by about {scattered:.0f} %. A seed draws the same noise at "
             "every level, only scaled, so averaging over the levels does not reduce this scatter.\n",
             markdown(arranged(noisy, ["system", "noise"], "efficiency")),
-            f"Lost fits (E2 above {LOST:g} times the bound): {lost_fits(noisy, (*NEAR_BOUND, 'pinn-vp'))}.\n",
+            f"Lost fits (E2 above {LOST:g} times the bound): {lost_fits(noisy, (*NEAR_BOUND, 'pielm'))}.\n",
         ]
     )
 
@@ -229,7 +231,7 @@ def more_of(table: pd.DataFrame, axis: str) -> str:
     """Write the section on more samples or more sites; the values in the middle are those of the part `noise`."""
     middle = (table["part"] == "noise") & table["own"] & (table["noise"] == COMPARED)
     arm = table[middle | (table["part"] == axis)].sort_values(["system", axis], kind="stable")
-    arm = arm[arm["method"] != "pinn-vp"]
+    arm = arm[arm["method"] != "pielm"]
     wide = arranged(fair(arm), ["system", axis], "e2", bound=True)
     least, most = min(arm[axis]), max(arm[axis])
     falls = {
@@ -291,8 +293,8 @@ def advice(own: pd.DataFrame, large: pd.DataFrame) -> list[str]:
         f"error is {span(error_ratio(large, chooser, 'trajectory'))} times that of `trajectory`, which keeps all "
         f"terms. The error of `weak` is {span(error_ratio(large, 'weak', 'trajectory'))} times "
         f"that of `trajectory`, at {slower['weak']:.2g} s per fit.",
-        f"- **The network** (`pinn-vp`) has {span(error_ratio(own, 'pinn-vp', first))} times the error of `{first}` "
-        f"and takes {seconds['pinn-vp'] / seconds[first]:.0f} times as long.",
+        f"- **The network** (`pielm`) has {span(error_ratio(own, 'pielm', first))} times the error of `{first}` "
+        f"and takes {seconds['pielm'] / seconds[first]:.0f} times as long.",
         f"- **Regression on derivatives** (`stlsq`) is fast, at {seconds['stlsq']:.2g} s per fit. With noise "
         f"its error is {span(error_ratio(own, 'stlsq', first))} times that of `{first}`; with pysindy's finite "
         f"differences, {span(error_ratio(own, 'stlsq-differences', first))} times. `sindy-tuned`, which chooses "

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from latticebench.bench.cli import main
+from latticebench.bench.published import read_head
 from latticebench.bench.report.schema import DOCUMENTS
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "measured"
@@ -249,7 +250,8 @@ def test_a_method_in_one_file_stands_beside_the_paper_after_three_commands(tmp_p
     succeed("run", "paper", "--methods", "mine.py", *only, "--results", "mine", "--jobs", 1, cwd=tmp_path)
     shown = succeed("table", "mine", "--with", paper, "--out", "published", cwd=tmp_path)
     assert "stlsq*" in shown
-    assert "* published: results/paper, commit b9656e544ace" in shown
+    commit = read_head(paper / "cases.csv")["commit"]
+    assert f"* published: results/paper, commit {commit}" in shown
     table = (tmp_path / "published" / "errors.tex").read_text()
     assert all(f"\n{part} & " in table for part in ("1a", "1b", "1c", "2a, noise"))
     assert "& {mine} & {pinn*} &" in table
@@ -265,11 +267,11 @@ def test_a_method_in_one_file_stands_beside_the_paper_after_three_commands(tmp_p
     assert {Path(path).name for path in written if path.startswith("all")} == {
         "ranks.png", *(f"{name}.{form}" for name in ("against", "against-cases") for form in ("csv", "md", "tex"))
     }  # fmt: skip
-    assert (tmp_path / "all" / "against-cases.csv").read_text().count("\n1a,phi4 C=2 v=0.5,lib1,") == 7
+    assert (tmp_path / "all" / "against-cases.csv").read_text().count("\n1a,phi4 C=2 v=0.5,lib1,") == 8
     bad = latticebench("figures", "mine", "--only", "errors", "--out", "errors.gif", cwd=tmp_path)
     assert (bad.returncode, "unknown ending '.gif'" in bad.stderr) == (2, True)
     rows = document("run", succeed("table", "mine", "--with", paper, "--json", cwd=tmp_path))["cases"]
-    assert {row["published"] for row in rows if row["method"].startswith("stlsq")} == {"b9656e544ace"}
+    assert {row["published"] for row in rows if row["method"].startswith("stlsq")} == {commit}
     assert {row["published"] for row in rows if row["method"] == "mine"} == {""}
     found = document(
         "against", succeed("compare", "mine", "--with", paper, "--against", "mine", "--json", cwd=tmp_path)

@@ -21,7 +21,7 @@ def test_a_script_can_be_imported(script: Callable[[str], ModuleType], path: str
     assert script(path).__doc__
 
 
-@pytest.mark.parametrize("path", ["cross/cross.py", "limits/which.py", "paper/claims.py"])
+@pytest.mark.parametrize("path", ["ablation/ablation.py", "cross/cross.py", "limits/which.py", "paper/claims.py"])
 def test_a_page_is_what_its_script_makes_of_the_tables_beside_it(
     script: Callable[[str], ModuleType], path: str
 ) -> None:
