@@ -12,11 +12,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from latticebench import methods
 from latticebench.bench.cli import main
 from latticebench.bench.demo import write_recording
+from latticebench.bench.published import read_head
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -121,6 +123,20 @@ def test_the_files_that_a_page_links_to_exist(name: str) -> None:
     for target in re.findall(r"\]\(([^)#:]+)\)", text):
         if not target.startswith("run/"):
             assert (ROOT / name).parent.joinpath(target).exists(), target
+
+
+def test_the_result_that_the_readme_shows_is_the_published_one() -> None:
+    published = pd.read_csv(ROOT / "results" / "default" / "errors.csv", comment="#", dtype=str)
+    (shown,) = re.findall(r"<!-- result -->\n(.*?)<!-- end -->", README, re.DOTALL)
+    head = read_head(ROOT / "results" / "default" / "errors.csv")
+    assert all(head[name] in shown for name in ("commit", "date"))
+    names, _, *rows = (
+        [cell.strip() for cell in row.strip("|").split("|")] for row in re.findall(r"^\|.*", shown, re.M)
+    )
+    assert rows
+    for row in rows:
+        wanted = published[(published["data"] == row[0]) & (published["library"] == row[1])].iloc[0]
+        assert row == [str(wanted[name]).removesuffix(" n=5") for name in names]
 
 
 def test_the_readme_has_at_most_600_words() -> None:
