@@ -60,6 +60,9 @@ def test_every_number_of_a_suite_is_that_of_its_csv_file(whole_site: Path, page:
         for column, text in published.items():
             if column in ("data", "part") and column not in row:
                 continue
+            if column in ("e2_low", "e2_high") and published["seeds"] in ("0", "1"):
+                # One seed has no spread to show.
+                text = ""
             assert column == "data" or row.get(column, "") == text, column
         for column, cell in zip(columns, cells, strict=True):
             if column not in ("ok", "data", "library", "method", "system", "part") and row[column]:
