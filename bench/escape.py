@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from latticebench.systems.errors import printable
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # A cell that begins so is a formula to a spreadsheet, unless it is a number.
 FORMULA = ("=", "+", "-", "@")
@@ -37,7 +38,7 @@ def csv_text(cell: str) -> str:
 def csv_table(frame: pd.DataFrame) -> str:
     """Return a table as CSV, with all digits."""
     safe = frame.map(csv_cell)
-    safe.columns = pd.Index([csv_cell(str(name)) for name in frame.columns])
+    safe.columns = [csv_cell(str(name)) for name in frame.columns]
     return str(safe.to_csv(index=False))
 
 

@@ -47,8 +47,8 @@ def table(
     store = open_store(folder)
     published = None if beside is None else read_published(beside)
     # Results of several kinds have folders of their own.
-    for part in (Path(), Path("fit")) if out is not None else ():
-        check_places([None if published is None else published.file], out=out / part / "cases.csv")
+    for place_of_kind in () if out is None else (out, out / "fit"):
+        check_places([None if published is None else published.file], out=place_of_kind / "cases.csv")
     if as_json:
         print(document(store, beside=published), end="")
     else:
