@@ -23,6 +23,7 @@ import importlib.util
 import ipaddress
 import logging
 import re
+import signal
 import socket
 import sys
 from collections.abc import Iterator
@@ -205,13 +206,17 @@ def _quiet() -> None:
     """Let Dask not speak of workers that come and go, nor of connections: the run says what matters of them."""
     import distributed  # noqa: F401
 
-    for name in ("distributed", "distributed.client", "distributed.nanny"):
+    for name in ("distributed", "distributed.client", "distributed.nanny", "tornado.application"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _batch_system(jobs: Jobs) -> Any:
+    # Importing it takes Ctrl-C away from whoever has it.
+    handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
     import dask_jobqueue
 
+    for one, handler in handlers.items():
+        signal.signal(one, handler)
     name = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "lsf": "LSFCluster", "sge": "SGECluster"}[jobs.system]
     given = {"queue": jobs.queue, "account": jobs.account, "interface": jobs.interface, "log_directory": jobs.logs}
     options = {

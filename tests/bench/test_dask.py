@@ -385,7 +385,7 @@ def test_slurm_runs_a_suite_through_a_cancelled_job_and_ctrl_c_ends_its_jobs(
     assert runner.poll() is None
     os.killpg(runner.pid, signal.SIGINT)
     _, err = runner.communicate(timeout=PATIENCE)
-    assert (runner.returncode, b"Traceback" in err) == (130, False), err
+    assert (runner.returncode, b"Traceback" in err) == (130, False), err.decode()
     wait_for(lambda: set(jobs()) <= set(before))
     gate.touch()
     out, err = start(RUN, *asked(path, store, "--cluster", "cluster.toml")).communicate(timeout=PATIENCE)
