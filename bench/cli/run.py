@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from latticebench.bench.case import Case
     from latticebench.bench.executors.cluster import Place
     from latticebench.bench.executors.executor import Executor
+    from latticebench.bench.run import Tally
     from latticebench.bench.store import Shard, Store
     from latticebench.bench.suite import Suite
 
@@ -30,47 +31,55 @@ EPILOG = (
     "A part of it, with a method of your own:  latticebench run paper --only 'phi4*' --methods stlsq,mine.py --dry-run"
 )
 
+ExecutorName = Annotated[
+    Literal["local", "dask"], typer.Option(help="Run cases in processes of this machine, or on workers of Dask's.")
+]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="tcp://HOST:PORT", help="With dask: a scheduler that runs; tls://, too.")
+]
+Cluster = Annotated[
+    str | None, typer.Option(metavar="local:N|FILE.toml", help="With dask: N workers here, or jobs of a batch system.")
+]
+AnyProcessor = Annotated[
+    bool, typer.Option("--any-processor", help="With dask: take unlike processors even for a suite that is timed.")
+]
+
+ResultsDir = Annotated[
+    Path | None, typer.Option(parser=place, metavar="DIR", help="Where results are kept; runs/SUITE if not given.")
+]
+
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Say how many cases it is and how long they took before; run nothing.")
+]
+
+ShardText = Annotated[
+    str | None, typer.Option(metavar="K/N", help="Run every N-th case alone, beginning with the K-th.")
+]
+
 
 def run(
     suite: Annotated[
         str, typer.Argument(help="A name from `list suites`, or a .toml file.", autocompletion=complete_suites)
     ],
     jobs: Jobs = None,
-    executor: Annotated[
-        Literal["local", "dask"], typer.Option(help="Run cases in processes of this machine, or on workers of Dask's.")
-    ] = "local",
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:PORT", help="With dask: a scheduler that runs; tls://, too.")
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(metavar="local:N|FILE.toml", help="With dask: N workers here, or jobs of a batch system."),
-    ] = None,
-    any_processor: Annotated[
-        bool, typer.Option("--any-processor", help="With dask: take unlike processors even for a suite that is timed.")
-    ] = False,
-    results: Annotated[
-        Path | None, typer.Option(parser=place, metavar="DIR", help="Where results are kept; runs/SUITE if not given.")
-    ] = None,
+    executor: ExecutorName = "local",
+    scheduler: Scheduler = None,
+    cluster: Cluster = None,
+    any_processor: AnyProcessor = False,
+    results: ResultsDir = None,
     retry: Annotated[bool, typer.Option("--retry", help="Run cases that failed again.")] = False,
     only: Only = None,
     methods: Methods = None,
     seeds: Seeds = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say how many cases it is and how long they took before; run nothing.")
-    ] = False,
-    shard: Annotated[
-        str | None, typer.Option(metavar="K/N", help="Run every N-th case alone, beginning with the K-th.")
-    ] = None,
+    dry_run: DryRun = False,
+    shard: ShardText = None,
     data: Recordings = Path("data"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the tables of cases as JSON.")] = False,
     yes: Yes = False,
 ) -> None:
     """Run a suite, continuing where it was stopped, and show its results."""
     from latticebench.bench.choice import chosen
-    from latticebench.bench.progress import progress_of
     from latticebench.bench.provenance import command_line
-    from latticebench.bench.run import run as run_suite
     from latticebench.bench.store import create
     from latticebench.bench.suite import load
 
@@ -87,30 +96,38 @@ def run(
     store = create(folder)
     about: dict[str, Any] = {"command": command_line(), "suite": loaded.name, "chosen": str(choice)}
     about |= {"settings": _contestants(loaded)} if loaded.contestants else {}
-    # A cluster that ends a job says so first; that is the same as Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        with (
-            _executor(where, loaded, folder, jobs, any_processor) as chosen_one,
-            progress_of(len(loaded.cases[part.first - 1 :: part.step])) as watcher,
-        ):
-            _, tally = run_suite(
-                loaded, store, executor=chosen_one, retry=retry, shard=part, watcher=watcher,
-                about={**about, **chosen_one.about},
-            )  # fmt: skip
-    except KeyboardInterrupt:
-        print(
-            f"stopped; {len(store.results())} results are in {shown(folder)}; the same command continues from there",
-            file=sys.stderr,
-        )
-        raise
+    with _executor(where, loaded, folder, jobs, any_processor) as one:
+        tally = _run(loaded, store, one, part, retry, {**about, **one.about})
     title = loaded.title
     # What is shown is read from the store; a hundred thousand cases need not be held beside it.
-    del loaded, watcher, chosen_one
+    del loaded, one
     if as_json:
         print(document(store, part), end="")
     else:
         _show(store, title, part, f"{tally.ran} run now, {tally.reused} were there; kept in {shown(folder)}")
+
+
+def _run(suite: Suite, store: Store, executor: Executor, part: Shard, retry: bool, about: dict[str, Any]) -> Tally:
+    """Run a suite with a display of its progress; return what was done.
+
+    Raises:
+        KeyboardInterrupt: the user stopped it, and has been told how it goes on.
+    """
+    from latticebench.bench.progress import progress_of
+    from latticebench.bench.run import run as run_suite
+
+    # A cluster that ends a job says so first; that is the same as Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with progress_of(len(suite.cases[part.first - 1 :: part.step])) as watcher:
+            return run_suite(suite, store, executor=executor, retry=retry, shard=part, watcher=watcher, about=about)[1]
+    except KeyboardInterrupt:
+        print(
+            f"stopped; {len(store.results())} results are in {shown(store.path.parent)}; the same command continues "
+            "from there",
+            file=sys.stderr,
+        )
+        raise
 
 
 def _place(
