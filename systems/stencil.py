@@ -21,7 +21,7 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
     from numpy import ndarray
 
 Ends = Literal["unknown", "free", "fixed", "periodic", "antiperiodic"]
@@ -172,11 +172,6 @@ class Stencil:
         """The factor of each site of a padded field; None for 1."""
         whole = functools.reduce(np.multiply.outer, (factor for _, factor in self._ghosts))
         return None if np.all(whole == 1) else whole
-
-    @functools.cached_property
-    def walls(self) -> Bool[ndarray, " *padded"]:
-        """Where a padded field is zero, whatever value stands in for it."""
-        return np.asarray(functools.reduce(np.multiply.outer, (factor for _, factor in self._ghosts)) == 0)
 
     def pad(self, field: ndarray, after: int = 0) -> ndarray:
         """Return a field with what the ends repeat on all sides; its last axes but `after` hold the sites."""

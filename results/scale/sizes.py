@@ -1,8 +1,9 @@
 """Measure what a lattice's size costs: processor time, memory and error of simulation and fits, one process each.
 
-    python results/scale/sizes.py [MOST]
+    python results/scale/sizes.py [MOST [TASK ...]]
 
-measures what sizes.csv lacks, up to MOST sites, and writes sizes.csv, sizes.md and sizes.png.
+measures what sizes.csv lacks, up to MOST sites and of the tasks that are named, and writes sizes.csv, sizes.md and
+sizes.png.
 
 Samples are made once for each size: phi^4 (C = 2) in motion everywhere, 101 times in a span of 10, 1 % noise. Time is
 the processor's, without the start of Python. Memory is the peak of what the process itself allocates (RssAnon, read
@@ -18,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Collection
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -93,7 +95,7 @@ def measure(task: str, sites: int, path: Path) -> dict[str, float | str]:
     return {"task": task, "sites": sites, "cpu_seconds": round(seconds, 3), "mib": round(peak.mib, 1), **found}
 
 
-def measured(most: int) -> pd.DataFrame:
+def measured(most: int, tasks: Collection[str]) -> pd.DataFrame:
     """Return the table of all tasks, of which those that sizes.csv lacks are done now."""
     place = HERE / "sizes.csv"
     rows = pd.read_csv(place, comment="#").to_dict("records") if place.exists() else []
@@ -101,7 +103,7 @@ def measured(most: int) -> pd.DataFrame:
         for sites in (one for one in SIZES if one <= most):
             path = Path(folder) / "samples.npz"
             there = {row["task"] for row in rows if row["sites"] == sites}
-            wanted = [task for task, largest in TASKS.items() if sites <= largest and task not in there]
+            wanted = [task for task in TASKS if task in tasks and sites <= TASKS[task] and task not in there]
             if wanted and wanted[0] != "simulate":
                 wanted = ["simulate", *wanted]
             for task in wanted:
@@ -138,7 +140,7 @@ def slope(table: pd.DataFrame, column: str) -> float:
 def page(table: pd.DataFrame) -> str:
     """Return the text of sizes.md."""
     parts = ["# What a lattice's size costs\n", "Made by `python results/scale/sizes.py`.\n"]
-    parts.append((__doc__ or "").split("sizes.png.\n")[1].strip() + "\n")
+    parts.append((__doc__ or "").split("\nsizes.png.\n")[1].strip() + "\n")
     parts.append("![Time and memory against size](sizes.png)\n")
     for column, title in (("cpu_seconds", "Processor seconds"), ("mib", "Memory (MiB)"), ("e2", "E2")):
         some = table.dropna(subset=[column])
@@ -173,6 +175,6 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["one"]:
         print(json.dumps(measure(sys.argv[2], int(sys.argv[3]), Path(sys.argv[4]))))
     else:
-        sizes = measured(int(sys.argv[1]) if len(sys.argv) > 1 else max(SIZES))
+        sizes = measured(int(sys.argv[1]) if len(sys.argv) > 1 else max(SIZES), sys.argv[2:] or TASKS)
         write_text(HERE / "sizes.md", page(sizes) + "\n" + "".join(f"- {line}\n" for line in made()))
         figure(sizes, HERE / "sizes.png")
