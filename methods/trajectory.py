@@ -56,7 +56,7 @@ class Trajectory:
     @property
     def abilities(self) -> Abilities:
         """The method takes complex fields, inputs, uneven times and missing values, and returns a motion."""
-        return Abilities(missing=True, motion=True, loads=LOADS)
+        return Abilities(missing=True, motion=True, memory=200, loads=LOADS)
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Fit by maximum likelihood, and select terms if `select` is set.
