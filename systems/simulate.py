@@ -176,7 +176,7 @@ def _adaptive(
             if solver.nfev > TRIED and solver.nfev * (times[-1] - times[0]) > HOPELESS * (solver.t - times[0]):
                 raise _Exhausted
             last = int(np.searchsorted(times, solver.t, side="right"))
-            curve = solver.dense_output() if last > first else solver.y
+            curve: Any = solver.dense_output() if last > first else None
         for some in pieces(last - first, 1, TOGETHER):
             found = curve(times[first + some.start : first + some.stop])
             for state in found.T:

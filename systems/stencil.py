@@ -200,11 +200,11 @@ class Stencil:
         for some in pieces(inner.stop - inner.start, 1, most):
             sites = slice(inner.start + some.start, inner.start + some.stop)
             read = index[some.start : some.stop + left + right]
-            columns: slice | ndarray = np.unique(read)
-            if len(columns) == columns[-1] - columns[0] + 1:
-                place, columns = read - columns[0], slice(int(columns[0]), int(columns[-1]) + 1)
-            else:
-                place = np.searchsorted(columns, read)
+            listed = np.unique(read)
+            columns: slice | ndarray = listed
+            if len(listed) == listed[-1] - listed[0] + 1:
+                columns = slice(int(listed[0]), int(listed[-1]) + 1)
+            place = np.searchsorted(listed, read)
             ends = factor[some.start : some.stop + left + right]
             yield Window(sites, columns, place, ends, numbers(self.shape[0], sites))
 

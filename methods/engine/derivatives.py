@@ -129,7 +129,8 @@ def differentiator(
         InputError: there is no such kind, its options are wrong, or there are too few samples.
     """
     check_options(kind, options)
-    parts = [np.real, np.imag] if np.iscomplexobj(field) else [np.asarray]
+    parts: list[Callable[[ndarray], ndarray]] = [np.real, np.imag] if np.iscomplexobj(field) else [np.asarray]
+    each: list[Callable[[ndarray], Smoothed]]
     if kind not in get_args(Ours):
         each = [functools.partial(_pysindy, t, kind=kind, options=options or {}) for _ in parts]
     elif any(np.any(np.isnan(field[some])) for some in rows_of(field)):
