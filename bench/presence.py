@@ -9,7 +9,7 @@ import json
 import platform
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +21,8 @@ from latticebench.bench.store import Store
 # Seconds between two tellings; how many of the last cases that went wrong are named.
 TOLD = 2.0
 NAMED = 10
+# More cases than any run has.
+MOST = 10**12
 
 
 @dataclass
@@ -102,16 +104,33 @@ class Running:
         return self.seconds / self.done * (self.left - self.done) if self.done else None
 
 
-def running(store: Store) -> Iterator[Running]:
-    """Return the runs that are on a store now."""
+def running(store: Store) -> list[Running]:
+    """Return the runs that are on a store now.
+
+    Raises:
+        InputError: what is told of one is damaged.
+    """
     # An older store has no such table until it is written to.
     if not list(store.read("SELECT 1 FROM sqlite_schema WHERE name = 'runs'")):
-        return
+        return []
+    found: list[Running] = []
     now = time.time()
     with store.sound():
         for owner, until, text in store.read("SELECT owner, until, content FROM runs"):
             if until > now and not is_gone(owner):
                 told = json.loads(text)
-                cases = tuple((title, where, now - since) for title, (where, since) in told["running"].items())
-                machine = str(owner).partition(" ")[0]
-                yield Running(machine, told["left"], told["done"], now - told["began"], cases, tuple(told["wrong"]))
+                cases = tuple((title, where, _age(now, since)) for title, (where, since) in told["running"].items())
+                machine, age = str(owner).partition(" ")[0], _age(now, told["began"])
+                # The store may be anybody's.
+                left, done = (int(told[name]) for name in ("left", "done"))
+                if not (0 <= left <= MOST and 0 <= done <= MOST):
+                    raise ValueError(f"{done} of {left} cases")
+                found.append(Running(machine, left, done, age, cases, tuple(map(str, told["wrong"]))))
+    return found
+
+
+def _age(now: float, since: float) -> float:
+    """Return for how many seconds something has been so, at least a little; clocks of two machines may differ."""
+    if not 0 <= since <= 2 * now:
+        raise ValueError(f"a time of {since!r}")
+    return max(now - since, 0.001)

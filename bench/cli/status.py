@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from latticebench.bench.cli.options import place
+from latticebench.systems.errors import printable
 from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
@@ -33,8 +34,8 @@ def status(
     statuses = store.statuses()
     done = sum(statuses.values())
     told = f" ({', '.join(f'{n} {name}' for name, n in statuses.items())})" if statuses else ""
-    print(f"{shown(folder)}: {done} of {total} cases are done{told}")
-    runs = list(running(store))
+    print(f"{shown(folder)}: {done} of {total} cases are done{printable(told)}")
+    runs = running(store)
     for one in runs:
         _show(one)
     if not runs:
@@ -43,7 +44,6 @@ def status(
 
 def _show(run: Running) -> None:
     from latticebench.bench.progress import clock
-    from latticebench.systems.errors import printable
 
     rate = f"{60 * run.done / run.seconds:.3g} a minute" if run.done else "none yet"
     left = f", about {clock(run.remaining)} left" if run.remaining is not None else ""

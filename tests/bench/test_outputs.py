@@ -189,6 +189,26 @@ def test_a_lease_from_far_ahead_keeps_nobody_waiting(tmp_path: Path) -> None:
         assert mine.take("key"), until
 
 
+@pytest.mark.parametrize(
+    "told",
+    [
+        "[", "[]", '{"left": "x"}', '{"left": 1e300}', '{"done": -1}', '{"began": NaN}', '{"began": 1e300}',
+        '{"began": "\\u001b"}', '{"running": {"a": 1}}', '{"running": {"\\u001b[1m": ["\\u001b", 1e300]}}',
+        '{"running": {"\\u001b[1m": ["\\u001b", 5]}}', '{"wrong": 5}', '{"wrong": ["\\u001b[1m", null]}', "{}",
+    ],
+)  # fmt: skip
+def test_what_a_damaged_store_says_of_a_run_is_told_or_refused_in_one_line(told: str, tmp_path: Path) -> None:
+    whole = {"left": 4, "done": 2, "began": time.time() - 5, "running": {}, "wrong": []}
+    store = create(tmp_path / "store")
+    content = f"{json.dumps(whole)[:-1]}, {told[1:]}" if len(told) > 2 else told
+    until = time.time() + 30
+    store.connection.execute("INSERT INTO runs VALUES (?, ?, ?)", ("another machine 1 0.00 x", until, content))
+    code, out, err = latticebench(tmp_path, "status", "store")
+    assert code in (0, 2)
+    assert code == 0 or (err.startswith("error: ") and err.count("\n") == 1), err
+    assert "\x1b" not in out + err
+
+
 # Published tables.
 
 
