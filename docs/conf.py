@@ -70,9 +70,13 @@ sphinx_gallery_conf = {
 
 
 def literal(_app: Any, _what: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
-    """Keep bars, stars and underscores of formulas as they are."""
+    """Keep bars, stars and underscores of formulas as they are; an example is literal anyway, up to an empty line."""
     lines[:] = inspect.cleandoc("\n".join(lines)).splitlines()
+    example = False
     for number, line in enumerate(lines):
+        example = bool(line.strip()) and (example or line.lstrip().startswith(">>>"))
+        if example:
+            continue
         parts = line.split("`")
         parts[::2] = [re.sub(r"([|*]|_(?=\W|$))", r"\\\1", part) for part in parts[::2]]
         lines[number] = "`".join(parts)
