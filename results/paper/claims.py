@@ -63,7 +63,7 @@ def learning(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """
     found = []
     for result in results:
-        case = FitCase.model_validate(result["case"])
+        case = FitCase.of(result["case"])
         if case.part not in IN_MOTION or case.label != "pinn" or result["history"] is None:
             continue
         clean = samples(case, Path())[0]
