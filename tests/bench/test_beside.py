@@ -18,7 +18,7 @@ from latticebench.bench.paired import paired
 from latticebench.bench.publish import TABLES, best, matrix, publish, render
 from latticebench.bench.published import read_head
 from latticebench.bench.store import create
-from latticebench.bench.tables import CASES, cases, read_cases
+from latticebench.bench.tables import CASES, SHOWN, cases, read_cases
 from latticebench.bench.worker import outcome
 from latticebench.systems.errors import InputError
 
@@ -50,7 +50,8 @@ def test_a_run_joins_published_rows_of_the_same_cases_whoever_fitted_them() -> N
     for library, part in (("lib1", "1a"), ("lib2", "1b")):
         rows = table[table["library"] == library]
         wanted = there[there["part"] == part]
-        assert list(rows["method"].str.removesuffix(" (shown the truth)")) == ["mine", *(wanted["method"] + "*")]
+        named = wanted["method"].str.removesuffix(SHOWN) + "*"
+        assert list(rows["method"].str.removesuffix(SHOWN)) == ["mine", *named]
         assert list(rows["e2"][1:]) == list(wanted["e2"])
         assert set(rows["part"]) == {part}
         assert list(rows["published"]) == ["", *[COMMIT] * len(wanted)]
