@@ -7,7 +7,8 @@ sizes.png.
 
 Samples are made once for each size: phi^4 (C = 2) in motion everywhere, 101 times in a span of 10, 1 % noise. Time is
 the processor's, without the start of Python. Memory is the peak of what the process itself allocates (RssAnon, read
-every 10 ms); files that are mapped, which the system can drop, are not in it. It needs Linux.
+every 10 ms); files that are mapped, which the system can drop, are not in it. It needs Linux. What is empty
+was not measured.
 """
 
 from __future__ import annotations
@@ -147,7 +148,7 @@ def page(table: pd.DataFrame) -> str:
         wide = some.pivot_table(index="sites", columns="task", values=column)
         wide = wide[[task for task in TASKS if task in wide]]
         wide.columns.name = None
-        parts.append(f"## {title}\n\n{wide.to_markdown(floatfmt='.3g')}\n")
+        parts.append(f"## {title}\n\n{wide.to_markdown(floatfmt='.3g').replace('nan', '   ')}\n")
         if column != "e2":
             grows = {task: slope(some[some["task"] == task], column) for task in TASKS}
             listed = ", ".join(f"`{task}` {value:.2f}" for task, value in grows.items() if np.isfinite(value))
