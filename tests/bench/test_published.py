@@ -10,6 +10,10 @@ import pandas as pd
 import pytest
 
 from latticebench import systems
+from latticebench.bench.against import against
+from latticebench.bench.paired import UNDECIDED
+from latticebench.bench.publish import format_number
+from latticebench.bench.tables import read_cases
 from latticebench.methods.engine.integrated_equation import PRICE, SPAN
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -27,6 +31,30 @@ def test_a_page_is_what_its_script_makes_of_the_tables_beside_it(
 ) -> None:
     published = (RESULTS / path).with_suffix(".md").read_text(encoding="utf-8")
     assert script(path).page() == published
+
+
+def test_the_headline_is_what_the_paired_tests_say(script: Callable[[str], ModuleType]) -> None:
+    text = " ".join((RESULTS.parent / "docs" / "protocol.md").read_text(encoding="utf-8").split())
+    default, paper = (
+        against(read_cases(RESULTS / name), "stlsq").methods.set_index("method") for name in ("default", "paper")
+    )
+    best, own, wide = default.loc["pinn-gn"], default.loc["pinn"], paper.loc["pinn-gn"]
+    parts = script("ablation/ablation.py")
+    table = parts.compared(parts.load()).set_index(["start", "noise", "method"])
+    clean, noisy = ([(start, noise) for start in parts.STARTS.values()] for noise in (0.0, 0.01))
+    assert [best["verdict"], own["verdict"], wide["verdict"]] == ["pinn-gn better", UNDECIDED, "pinn-gn better"]
+    assert all(table.loc[(*place, "trajectory"), "beside it"] == UNDECIDED for place in noisy)
+    follows = table.loc[(*clean[0], "trajectory")]
+    assert follows["beside it"] == "better"
+    for told in (
+        f"{best['wins']} of the {best['cases']} lattices and libraries",
+        f"(median ratio {format_number(best['ratio'])}, p = {format_number(best['p'])})",
+        f"{wide['wins']} of {wide['cases']} kinds of data",
+        f"(ratio {format_number(wide['ratio'])}, p = {format_number(wide['p'])})",
+        f"({own['wins']} won, {own['losses']} lost, p = {format_number(own['p'])})",
+        f"(ratio {format_number(follows['ratio'])}, p = {format_number(follows['p'])})",
+    ):
+        assert told in text
 
 
 def test_the_constants_in_use_are_those_that_their_table_chooses_on_lattices_outside_the_benchmark(
