@@ -19,7 +19,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from latticebench.bench.colours import series
+from latticebench.bench.colours import INK, SERIES, series
 from latticebench.bench.figures import LOWEST, MARKERS, save
 from latticebench.bench.paired import UNDECIDED, paired
 from latticebench.bench.publish import markdown_table
@@ -81,8 +81,10 @@ def point(axes: Axes, chosen: pd.DataFrame, place: int, method: str) -> None:
         middles.append(middle)
         ends.append([[middle - low], [high - middle]])
     (seconds, error), (across, along) = middles, ends
+    # There is one method more than colours.
+    colour = series(place) if place < len(SERIES) else INK
     axes.errorbar(
-        seconds, error, yerr=along, xerr=across, fmt=MARKERS[place % len(MARKERS)], color=series(place), ms=5,
+        seconds, error, yerr=along, xerr=across, fmt=MARKERS[place % len(MARKERS)], color=colour, ms=5,
         elinewidth=1.2, alpha=0.85, label=method,
     )  # fmt: skip
 
