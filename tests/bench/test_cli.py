@@ -413,7 +413,6 @@ BAD_COMMANDS = {
     "compare phi4.csv phi4.csv": "column 'identity' is missing",
     "compare json": "compare json with what?",
     "compare json json --against a": "give one run",
-    "compare phi4.csv --against a --json": "--out FILE.csv",
     "compare phi4.csv phi4.csv --out x.pdf": "go with --against",
     "compare phi4.csv --against a --out x.bmp": "unknown ending '.bmp'",
     "limit --system phi4": "--library",
