@@ -75,9 +75,12 @@ class Grid(Settings):
         if not contestants:
             raise InputError(f"{where}: the suite names no methods; write at least one [methods.LABEL]")
         labels = list(contestants) if self.methods is None else self.methods
-        for label in (*labels, *self.seeds_of):
+        for label in labels:
             if label not in contestants:
                 raise unknown("method", label, contestants, where)
+        for label in self.seeds_of:
+            if label not in contestants:
+                raise unknown("method", label, contestants, f"{where}: seeds_of")
         if not labels:
             raise InputError(f"{where}: methods: an empty list makes no cases; leave the key out")
         if not self.libraries and not self.terms:

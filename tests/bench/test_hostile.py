@@ -113,7 +113,7 @@ def write_suite(folder: Path, marker: str, deeds: Sequence[str]) -> Path:
             body = "pass\n"
         (folder / f"m{number}.py").write_text(body)
         text += f'[methods."{name}"]\nmethod = "m{number}.py"\n'
-        limit = "time_limit = 2\n" * (status == "timeout")
+        limit = f"time_limit = {5 if name == 'floods' else 2}\n" * (status == "timeout")
         text += (
             f'[[grid]]\n{limit}methods = ["{name}"]\n[[grid]]\nmethods = ["good"]\nseeds = [{number}]\nnoise = 0.01\n'
         )

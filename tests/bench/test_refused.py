@@ -33,7 +33,7 @@ RIGHT = {
     ("parameters", "{}"), ("terms", "{}"), ("libraries", "[]"), ("time_limit", "1e300"), ("noise", "1e300"),
     ("z", "1e300"), ("z", "1.5"), ("noise", "1.5"), ("span", "1.5"), ("time_limit", "1.5"), ("name", '"nope"'),
     ("name", '"1"'), ("seeds", '"1"'), ("file", '"nope"'),
-    ("file", '"../x"'), ("file", '"1"'), ("terms", '"1"'), ("settings", "{}"),
+    ("file", '"../x"'), ("file", '"1"'), ("terms", '"1"'), ("settings", "{}"), ("seeds_of", "{}"),
 }  # fmt: skip
 
 
