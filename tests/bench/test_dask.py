@@ -94,6 +94,7 @@ def cluster() -> Iterator[Connection]:
         yield connection
 
 
+@pytest.mark.slow
 def test_both_executors_make_the_same_rows_but_for_times_and_machines(cluster: Connection, tmp_path: Path) -> None:
     methods = {"lines": "least-squares", "good": "", "failing": 'deed = "fail"', "empty": 'deed = "nan"'}
     suite = suite_of(tmp_path / "s", methods, noise="[0.0, 0.01]", seeds="[1, 2]")
@@ -118,6 +119,7 @@ def test_both_executors_make_the_same_rows_but_for_times_and_machines(cluster: C
 
 
 @posix
+@pytest.mark.slow
 def test_the_cases_of_a_worker_that_is_killed_are_run_by_the_next(cluster: Connection, tmp_path: Path) -> None:
     diary, gate = tmp_path / "diary", tmp_path / "gate"
     suite = suite_of(tmp_path / "s", {"held": f'diary = "{diary}", gate = "{gate}"'}, seeds="[1, 2, 3]")

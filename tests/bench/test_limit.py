@@ -78,6 +78,7 @@ def test_the_bound_scales_with_the_noise():
     np.testing.assert_allclose(low.at(0.1).stderr, high.stderr, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_more_data_never_hurt():
     system = systems.find("phi4")
     one = system.library("lib2")

@@ -129,6 +129,7 @@ def test_an_effect_that_is_there_is_not_doubted(name, force):
     assert found.verdict == "explained"
 
 
+@pytest.mark.slow
 def test_what_misreads_in_time_beside_unknown_ends_is_fitted():
     def read(u):
         return u * (1 + 0.2 * np.outer(np.linspace(-1, 1, len(u)), np.eye(u.shape[1])[1]))

@@ -69,6 +69,7 @@ def test_every_number_of_a_suite_is_that_of_its_csv_file(whole_site: Path, page:
                 assert float(cell) == pytest.approx(float(row[column]), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_every_table_here_is_whole_on_some_page(whole_site: Path, page: Callable[..., Any]) -> None:
     for path in sorted(RESULTS.rglob("*.csv")):
         folder = whole_site / path.parent.relative_to(RESULTS)

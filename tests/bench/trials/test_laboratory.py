@@ -98,7 +98,7 @@ def test_what_a_recording_cannot_tell_from_an_effect_is_said_beside_it() -> None
     "names",
     [
         ["damping", "next-neighbour", "nonlinear-coupling", "quadratic-drag"],
-        ["asymmetric-coupling", "constant-force", "onsite-quintic"],
+        pytest.param(["asymmetric-coupling", "constant-force", "onsite-quintic"], marks=pytest.mark.slow),
     ],
 )
 def test_a_recording_moves_by_the_formulas_of_its_effects_in_the_catalogue(names: list[str]) -> None:
