@@ -88,8 +88,11 @@ def against(table: pd.DataFrame, reference: str) -> Contest:
         reference: the method; the mark of published ones may be left out.
 
     Raises:
-        InputError: there is no such method, or no other has a case of it.
+        InputError: the table lacks a column, there is no such method, or no other has a case of it.
     """
+    missing = [name for name in (*ABOUT, "method", "noise", "seed") if name not in table]
+    if missing:
+        raise InputError(f"not a table of cases: the column {missing[0]!r} is missing")
     errors = counted(table)
     errors = errors[errors["e2"].notna() & ~errors["method"].map(shown_truth)]
     wide = errors.pivot_table(

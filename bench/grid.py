@@ -89,8 +89,9 @@ class Grid(Settings):
             (name, tuple(terms)) for name, terms in self.terms.items()
         ]
         parameter_names = list(self.parameters)
-        drawn = {label: self.seeds_of.get(label, self.seeds) for label in labels}
-        seeds = list(dict.fromkeys(itertools.chain(*drawn.values())))
+        lists = {label: self.seeds_of.get(label, self.seeds) for label in labels}
+        seeds = list(dict.fromkeys(itertools.chain(*lists.values())))
+        drawn = {label: frozenset(of_one) for label, of_one in lists.items()}
         # Data outermost, methods innermost: a worker that has simulated a trajectory uses it for every method.
         for parameters in itertools.product(*self.parameters.values()):
             for axes in itertools.product(*(getattr(self, axis) for axis in AXES)):
