@@ -47,10 +47,12 @@ class Library:
         """Refuse an empty library and repeated terms."""
         if not self.terms:
             raise InputError(f"library {self.name!r} has no terms; give at least one, such as u[n]")
-        texts = self.texts
-        for text in texts:
-            if texts.count(text) > 1:
-                raise InputError(f"library {self.name!r} has the term {text!r} twice; leave one out")
+        seen: dict[str, str] = {}
+        for term in self.terms:
+            if term.plain in seen:
+                also = f", also written {seen[term.plain]!r}," * (seen[term.plain] != term.text)
+                raise InputError(f"library {self.name!r} has the term {term.text!r}{also} twice; leave one out")
+            seen[term.plain] = term.text
 
     @property
     def texts(self) -> tuple[str, ...]:

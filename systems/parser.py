@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import ast
 import math
+import re
+import unicodedata
 import warnings
 
 from latticebench.systems.errors import InputError
@@ -34,6 +36,8 @@ MAX_DEGREE = 24
 MAX_MONOMIALS = 200
 MAX_NESTED = 5
 MAX_NUMBER = 1e12
+# A smaller one is lost in any computation.
+MIN_NUMBER = 1e-100
 
 
 class TermError(InputError):
@@ -65,6 +69,10 @@ def parse(text: str, names: tuple[str, ...] = ()) -> ast.expr:
     for column, character in enumerate(text.rstrip()):
         if character == "#" or (character in "\r\n" and text[:column].strip()):
             raise TermError(text, column, "a term is one line without a comment")
+        # Python reads them as the plain ones; a person who reads the text would not know.
+        plain = unicodedata.normalize("NFKC", character)
+        if plain != character and f"a{character}".isidentifier():
+            raise TermError(text, column, f"write {plain!r} for {character!r}")
     # Python takes a leading blank for an indentation; errors count columns in the text as given.
     lead = len(text) - len(text.lstrip())
     try:
@@ -111,6 +119,11 @@ class _Whitelist(ast.NodeVisitor):
             raise self.refuse(node, f"{node.value!r} is not a real number{hint}")
         if not abs(node.value) <= MAX_NUMBER:
             raise self.refuse(node, f"a number must not exceed {MAX_NUMBER:g} in size")
+        written = ast.get_source_segment(self.text.strip(), node) or ""
+        # Python reads 1e-400 as 0.
+        is_zero = re.fullmatch(r"0[box][0_]+|[0._]+(e.*)?", written.lower())
+        if not is_zero and abs(node.value) < MIN_NUMBER:
+            raise self.refuse(node, f"a number other than 0 must not be below {MIN_NUMBER:g} in size")
 
     def visit_Name(self, node: ast.Name) -> None:
         if node.id in CONSTANTS or node.id in self.names:

@@ -22,6 +22,7 @@ import numpy as np
 from latticebench.systems.arrays import IN_MEMORY
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import DATA, check_regular, reading, shown
+from latticebench.systems.folders import ZARR, files_in, partition, zarr_arrays
 from latticebench.systems.layout import UNITS, Layout, choose, quoted
 from latticebench.systems.samples import Origin, Samples, check_alike
 from latticebench.systems.stencil import Ends
@@ -40,16 +41,18 @@ ARRAYS = ("t", "u", "v", "f", "trajectory")
 
 
 def read(path: Path, ends: Ends = "unknown", layout: Layout = PLAIN) -> list[Samples]:
-    """Return the trajectories of one file.
+    """Return the trajectories of one file, or of a folder as `latticebench.systems.folders` says.
 
     Args:
-        path: a file of `FORMATS` or `OTHERS`.
+        path: a file of `FORMATS` or `OTHERS`, or a folder.
         ends: how the chain ends.
         layout: how the recording lies in the file, if not as this project writes it.
 
     Raises:
         InputError: the file is missing, of another form, or holds invalid data; the message names file, row and column.
     """
+    if os.path.isdir(path):
+        return _from_folder(path, ends, layout)
     check_ending(path, (*FORMATS, *OTHERS))
     check_regular(path)
     if path.stat().st_size == 0:
@@ -83,6 +86,41 @@ def read_all(paths: Sequence[Path], ends: Ends = "unknown", layout: Layout = PLA
                     f"{data[0].source} in {units[1]}; read them apart, or bring them to one unit"
                 )
     return data
+
+
+def _from_folder(folder: Path, ends: Ends, layout: Layout) -> list[Samples]:
+    """Return the trajectories of a Zarr store, of a Parquet table in parts, or of all files in a folder."""
+    if folder.suffix.lower() == ZARR:
+        if layout.time is not None or layout.columns:
+            raise InputError(f"{shown(folder)}: it has arrays t and u, no columns; leave --time and --columns out")
+        arrays = zarr_arrays(folder, ARRAYS)
+        _check_names(list(arrays), shown(folder))
+        return _from_arrays(arrays, shown(folder), ends, layout)
+    files = files_in(folder)
+    if folder.suffix.lower() == ".parquet":
+        return _from_table(_parts(folder, files, layout), shown(folder), ends, layout)
+    found = [samples for file in files for samples in read(file, ends, layout)]
+    check_alike(found)
+    return found
+
+
+def _parts(folder: Path, files: Sequence[Path], layout: Layout) -> Table:
+    """Return the table of a Parquet folder."""
+    import pandas as pd
+
+    bodies: list[pd.DataFrame] = []
+    for file in files:
+        check_ending(file, (".parquet",))
+        body, label = _read_parquet(file, layout).body, partition(file, folder)
+        if label is not None and "trajectory" in body:
+            raise InputError(f"{shown(file)}: its folder and a column both say the trajectory; leave one out")
+        if bodies and list(body.columns) != list(bodies[0].columns)[: len(body.columns)]:
+            raise InputError(f"{shown(file)}: its columns are not those of {shown(files[0])}")
+        bodies.append(body if label is None else body.assign(trajectory=label))
+    labelled = ["trajectory" in body for body in bodies]
+    if any(labelled) and not all(labelled):
+        raise InputError(f"{shown(files[labelled.index(False)])}: it belongs to no trajectory, other parts do")
+    return Table(pd.concat(bodies, ignore_index=True))
 
 
 def check_ending(path: Path, endings: Sequence[str] = FORMATS) -> None:

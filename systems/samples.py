@@ -19,6 +19,12 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
+# Beyond it the square of the cube of a value is more than double precision holds; nothing can be fitted to it.
+LARGEST_VALUE = 1e50
+
+# Columns that a message names, at most.
+LISTED = 5
+
 
 @dataclass(frozen=True)
 class Origin:
@@ -101,11 +107,11 @@ class Samples:
     def _check_times(self) -> None:
         """Refuse times that are not finite or do not increase."""
         where = self.source
-        if not np.all(np.isfinite(self.t)):
-            row = int(np.flatnonzero(~np.isfinite(self.t))[0])
-            raise InputError(
-                f"{where}: row {row + 1}, column t: the time is missing or not finite; fill it in or leave the row out"
-            )
+        sound = np.abs(self.t) <= LARGEST_VALUE
+        if not np.all(sound):
+            row = int(np.flatnonzero(~sound)[0])
+            told = f"beyond {LARGEST_VALUE:g}" if np.isfinite(self.t[row]) else "missing or not finite"
+            raise InputError(f"{where}: row {row + 1}, column t: the time is {told}; fill it in or leave the row out")
         steps = np.diff(self.t)
         if np.any(steps <= 0):
             row = int(np.flatnonzero(steps <= 0)[0]) + 1
@@ -113,9 +119,15 @@ class Samples:
                 f"{where}: row {row + 1}, column t: time {self.t[row]:g} after {self.t[row - 1]:g}; "
                 "times must increase: sort the rows, or give several trajectories a column 'trajectory'"
             )
+        if np.any(steps < 1 / LARGEST_VALUE):
+            row = int(np.flatnonzero(steps < 1 / LARGEST_VALUE)[0]) + 1
+            raise InputError(
+                f"{where}: row {row + 1}, column t: it is {steps[row - 1]:g} after the row before, less than "
+                f"{1 / LARGEST_VALUE:g}; give times in a smaller unit"
+            )
 
     def _check_field(self, name: str) -> None:
-        """Refuse a field of another shape or kind than u, or with infinite values."""
+        """Refuse a field of another shape or kind than u, or with infinite or absurdly large values."""
         where, array = self.source, getattr(self, name)
         if array.shape != self.u.shape:
             raise InputError(
@@ -125,12 +137,16 @@ class Samples:
         if np.iscomplexobj(array) and (name == "f" or not np.iscomplexobj(self.u)):
             raise InputError(f"{where}: {name} is complex; it must be real{'' if name == 'f' else ' as u is'}")
         for some in rows_of(array):
-            if not np.any(np.isinf(array[some])):
+            # Not by the absolute value of a complex number, which overflows.
+            parts = (array[some].real, array[some].imag)
+            wrong = (np.abs(parts[0]) > LARGEST_VALUE) | (np.abs(parts[1]) > LARGEST_VALUE)
+            if not np.any(wrong):
                 continue
-            row, site = (int(k) for k in np.argwhere(np.isinf(array[some]))[0])
-            row += some.start
+            row, site = (int(k) for k in np.argwhere(wrong)[0])
+            told = "infinite" if np.isinf(array[some][row, site]) else f"beyond {LARGEST_VALUE:g}"
             raise InputError(
-                f"{where}: row {row + 1}, column {name}{site + 1}: infinite; leave the cell empty if it is missing"
+                f"{where}: row {row + some.start + 1}, column {name}{site + 1}: {told}; leave the cell empty if the "
+                "value is missing, or choose a larger unit"
             )
 
     @property
@@ -154,6 +170,21 @@ class Samples:
         """Whether any value is NaN."""
         arrays = [array for array in (self.u, self.v, self.f) if array is not None]
         return any(bool(np.any(np.isnan(array[some]))) for array in arrays for some in rows_of(array))
+
+    @functools.cached_property
+    def unread(self) -> tuple[int, ...]:
+        """The sites, from 0, at which neither u nor v was ever read."""
+        seen = np.zeros(self.sites, dtype=bool)
+        for array in (one for one in (self.u, self.v) if one is not None):
+            for some in rows_of(array):
+                seen |= ~np.all(np.isnan(array[some]), axis=0)
+        return tuple(np.flatnonzero(~seen).tolist())
+
+    def columns(self, sites: Sequence[int]) -> str:
+        """Return the names that the readings of some sites have in their file, as a list in words."""
+        known = self.origin.columns
+        named = [known[one] if known else f"{'re' if self.is_complex else 'u'}{one + 1}" for one in sites[:LISTED]]
+        return ", ".join([*named, *([f"{len(sites) - LISTED} others"] if len(sites) > LISTED else [])])
 
     def forcing(self, degree: int = 3) -> Callable[[ndarray], ndarray]:
         """Return the measured input as a function of times (B,), with values (B, N).

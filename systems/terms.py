@@ -48,6 +48,11 @@ class Term:
         return self.text
 
     @property
+    def plain(self) -> str:
+        """The text without blanks and needless brackets: one for all ways of writing the same operations."""
+        return _plain(self.text)
+
+    @property
     def reach(self) -> tuple[int, int]:
         """The number of sites that the term reads to the left and to the right, both >= 0."""
         offsets = [0, *(offset for _, offset in self.sites)]
@@ -67,7 +72,7 @@ class Term:
     @property
     def jumps(self) -> bool:
         """Whether the term is dry friction, sign(v[n]), which jumps where the velocity changes its sign."""
-        return self.text.replace(" ", "") == "sign(v[n])"
+        return self.plain == "sign(v[n])"
 
     @property
     def expression(self) -> sympy.Expr:
@@ -130,6 +135,11 @@ def _vanishes(expression: sympy.Expr) -> bool:
     if value.is_number and abs(complex(value)) > NOTHING:
         return False
     return bool(sympy.simplify(expression) == 0)
+
+
+@functools.lru_cache(maxsize=4096)
+def _plain(text: str) -> str:
+    return ast.unparse(parse(text))
 
 
 @functools.lru_cache(maxsize=4096)

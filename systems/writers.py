@@ -10,8 +10,9 @@ import numpy as np
 
 from latticebench.systems.arrays import IN_MEMORY, empty
 from latticebench.systems.errors import InputError
-from latticebench.systems.files import whole
-from latticebench.systems.readers import check_ending
+from latticebench.systems.files import shown, whole
+from latticebench.systems.folders import ZARR, whole_folder, write_zarr
+from latticebench.systems.readers import FORMATS, check_ending
 from latticebench.systems.samples import Samples, check_alike
 
 if TYPE_CHECKING:
@@ -19,16 +20,27 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
 
-def write(data: Sequence[Samples], path: Path) -> None:
-    """Write trajectories to one CSV, NPZ or Parquet file, whole or not at all; numbers keep all their digits.
+def write(data: Sequence[Samples], path: Path, *, parts: bool = False) -> None:
+    """Write trajectories to one CSV, NPZ or Parquet file or Zarr store, whole or not at all; numbers keep all digits.
 
     Arrays that are large are not compressed in an NPZ file, so that it can be read in parts.
+
+    Args:
+        data: the trajectories.
+        path: the file, or the folder of a Zarr store.
+        parts: write a folder of Parquet files, one for each trajectory.
 
     Raises:
         InputError: the ending is unknown, the trajectories differ in sites or columns, or the file cannot be written.
     """
-    check_ending(path)
+    check_ending(path, (*FORMATS, ZARR))
     check_alike(data)
+    if parts:
+        _write_parts(data, path)
+        return
+    if path.suffix.lower() == ZARR:
+        write_zarr(_arrays(data), path)
+        return
     with whole(path) as temporary:
         match path.suffix.lower():
             case ".npz":
@@ -41,6 +53,17 @@ def write(data: Sequence[Samples], path: Path) -> None:
                 _table(data).to_csv(temporary, index=False)
             case _:
                 _table(data).to_parquet(temporary, index=False)
+
+
+def _write_parts(data: Sequence[Samples], path: Path) -> None:
+    """Write a folder of Parquet files, one for each trajectory."""
+    if path.suffix.lower() != ".parquet":
+        raise InputError(f"{shown(path)}: only Parquet is written in parts; let the name end in .parquet")
+    with whole_folder(path) as temporary:
+        for number, samples in enumerate(data, start=1):
+            place = temporary / f"trajectory={number}"
+            place.mkdir()
+            _table([samples]).to_parquet(place / "part-0.parquet", index=False)
 
 
 def _arrays(data: Sequence[Samples]) -> dict[str, ndarray]:

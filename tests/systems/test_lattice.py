@@ -26,6 +26,12 @@ def test_a_library_without_terms_or_with_one_twice_is_refused():
         Library("twice", split("u[n]; u[n+1]; u[n]"))
 
 
+@pytest.mark.parametrize("other", ["(u[n+1])", "u[ n + 1 ]", "u[n+0x1]"])
+def test_a_term_that_is_written_in_two_ways_is_one_term_twice(other):
+    with pytest.raises(InputError, match=r"also written 'u\[n\+1\]', twice"):
+        Library("twice", split(f"u[n+1]; {other}"))
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "2", None, True])
 def test_a_parameter_that_is_no_finite_number_is_refused_by_name(value):
     with pytest.raises(InputError, match="parameter C"):

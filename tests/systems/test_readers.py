@@ -12,12 +12,14 @@ from hypothesis.extra import numpy as hnp
 
 from latticebench.systems.errors import InputError
 from latticebench.systems.readers import FORMATS, read, read_all
-from latticebench.systems.samples import Samples
+from latticebench.systems.samples import LARGEST_VALUE, Samples
 from latticebench.systems.writers import write
 
 # Round trips
 
-FINITE = st.floats(allow_nan=False, allow_infinity=False)
+FINITE = st.floats(-LARGEST_VALUE, LARGEST_VALUE)
+# Doubles lie closer than samples may only near zero.
+TIMES = FINITE.map(lambda time: time if abs(time) > 1e-30 else 0.0)
 REAL = st.one_of(FINITE, st.just(float("nan")))
 
 
@@ -29,7 +31,7 @@ def data_sets(draw):
     found = []
     for _ in range(draw(st.integers(1, 3))):
         rows = draw(st.integers(2, 6))
-        t = np.array(sorted(draw(st.lists(FINITE, min_size=rows, max_size=rows, unique_by=lambda x: x + 0.0))))
+        t = np.array(sorted(draw(st.lists(TIMES, min_size=rows, max_size=rows, unique_by=lambda x: x + 0.0))))
 
         def field(rows=rows):
             return draw(hnp.arrays(float, (rows, count), elements=REAL))
@@ -68,7 +70,7 @@ def test_what_is_written_is_read_again_to_the_last_digit(tmp_path, suffix, data)
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_random_digits_over_all_magnitudes_survive(tmp_path, suffix):
     draw = np.random.default_rng(0)
-    u = draw.normal(size=(500, 3)) * 10.0 ** draw.integers(-300, 300, (500, 3))
+    u = draw.normal(size=(500, 3)) * 10.0 ** draw.integers(-300, 49, (500, 3))
     data = [Samples(np.cumsum(draw.uniform(1e-9, 1, 500)), u)]
     write(data, tmp_path / f"data{suffix}")
     assert_same(read(tmp_path / f"data{suffix}"), data)
