@@ -29,7 +29,7 @@ from latticebench.methods.engine.bounds import checked
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples, SimulatedSamples
-from latticebench.systems.stencil import ghosts
+from latticebench.systems.stencil import ghosts, observed
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -52,6 +52,8 @@ class Abilities:
         motion: its fits have the motion that they follow, and the size of the noise.
         memory: bytes that a fit takes at most for each value of the samples and each term; 0 where it goes through
             them piece by piece.
+        window: sites of a trajectory that it takes at once at most, unless a term asks for the number of a site; 0 for
+            all of them.
         loads: packages that a fit imports; they are loaded before its clock starts.
         needs: packages that are not installed with this one.
     """
@@ -63,6 +65,7 @@ class Abilities:
     truth: bool = False
     motion: bool = False
     memory: float = 0.0
+    window: int = 0
     loads: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
 
@@ -296,6 +299,24 @@ def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:
             raise InputError(f"{samples.source}: the library uses i, but the field is real; leave the terms with i out")
     if library.uses("v") and order == 1:
         raise InputError("the library uses v[n], but an equation of order 1 has no velocity; use --order 2")
+    _check_read(data, library)
+
+
+def _check_read(data: Sequence[Samples], library: Library) -> None:
+    """Refuse readings that leave as many motions unknown as there are equations: they determine no coefficient.
+
+    Each site that was never read is an unknown function of time, each site with an equation a relation between them.
+    """
+    for samples in data:
+        inner = observed(samples.sites, library.reach, samples.ends)
+        if len(samples.unread) < inner.stop - inner.start:
+            return
+    first = data[0]
+    raise InputError(
+        f"{first.source}: nothing was ever read of {first.columns(first.unread)}, and only "
+        f"{inner.stop - inner.start} site(s) have an equation: no coefficient can be determined; say how the chain "
+        "ends (--ends), take terms with fewer neighbours, or give readings of these sites"
+    )
 
 
 def obstacle(abilities: Abilities, data: Sequence[Samples], library: Library) -> str:
@@ -319,23 +340,20 @@ def obstacle(abilities: Abilities, data: Sequence[Samples], library: Library) ->
         ),
     ]
     reason = next((reason for able, asks, reason in checks if not able and any(asks(s) for s in data)), "")
-    return reason or too_large(abilities.memory, data, library)
+    return reason or too_large(abilities, data, library)
 
 
-def too_large(memory: float, data: Sequence[Samples], library: Library) -> str:
-    """Return that the data take more memory than there is; empty where they do not.
-
-    Args:
-        memory: bytes for each value (site, time and part) and term.
-        data: the trajectories.
-        library: the terms.
-    """
-    values = sum(samples.u.size * (1 + samples.is_complex) for samples in data)
-    needed, there = memory * values * len(library.terms), _free()
+def too_large(abilities: Abilities, data: Sequence[Samples], library: Library) -> str:
+    """Return that the data take more memory than there is; empty where they do not."""
+    sizes = [samples.u.size * (1 + samples.is_complex) for samples in data]
+    values = float(sum(sizes))
+    if abilities.window and not library.uses("n"):
+        values = max(size * min(abilities.window / one.sites, 1) for size, one in zip(sizes, data, strict=True))
+    needed, there = abilities.memory * values * len(library.terms), _free()
     if needed <= there:
         return ""
     return (
-        f"it would take about {needed / 2**30:.2g} GiB for {values} values and {len(library.terms)} terms, and "
+        f"it would take about {needed / 2**30:.2g} GiB for {values:.0f} values and {len(library.terms)} terms, and "
         f"{there / 2**30:.2g} GiB may be used; show it fewer sites, samples or terms, or take a method that goes "
         "through them piece by piece, as least squares does"
     )

@@ -21,7 +21,7 @@ import numpy as np
 from latticebench.methods.engine.bounds import Positive
 from latticebench.methods.engine.derivatives import Differentiating
 from latticebench.methods.engine.integrated_equation import integrate_equation
-from latticebench.methods.engine.regression import Regression, rows, triangular
+from latticebench.methods.engine.regression import Regression, sums, triangular
 from latticebench.methods.engine.sparse import fitted_optimizer
 from latticebench.methods.method import Abilities, Fit
 from latticebench.systems.lattice import Library
@@ -73,7 +73,7 @@ class MIOSR(Differentiating):
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Find the best support of every number of terms, and take the one of the least criterion."""
-        regression = rows(data, library, order, self.differentiation, self.options)
+        regression = sums(data, library, order, self.differentiation, self.options)
         models = best_subsets(regression, self.patience, seed)
         scores = integrate_equation(data, library, order).bic(models)
         number = int(np.nanargmin(scores))

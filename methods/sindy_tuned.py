@@ -26,8 +26,9 @@ and the support right in 96 % of 48 recordings; with the usual price 1.51 and 85
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -41,7 +42,7 @@ from latticebench.methods.engine.integrated_equation import (
     information_criterion,
     integrate_equation,
 )  # fmt: skip
-from latticebench.methods.engine.regression import Regression, row_pieces, triangular
+from latticebench.methods.engine.regression import Regression, folded, joined, row_pieces, triangular
 from latticebench.methods.engine.sparse import THRESHOLDS, fitted_optimizer, sparse_fit, stlsq_path
 from latticebench.methods.method import Abilities, Fit
 from latticebench.systems.errors import InputError
@@ -55,6 +56,8 @@ if TYPE_CHECKING:
 Optimizer = Literal["STLSQ", "SR3", "SSR", "FROLS", "ensemble"]
 # The rows that a bagged model draws: more cost time and change nothing.
 MOST_DRAWN = 1000
+# Rows that are kept to draw from.
+MOST_KEPT = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +66,46 @@ class DerivativeRows:
 
     Attributes:
         differentiation: its kind, with its options.
-        regression: the rows.
-        place: where in its trajectory each row is, from 0 to 1.
+        parts: the rows of each part of the trajectories, or as few that have the same sums of squares.
+        drawn: rows from which bags are drawn: all, or some where there are many.
     """
 
     differentiation: str
-    regression: Regression
-    place: Float[ndarray, " rows"]
+    parts: tuple[Regression, ...]
+    drawn: Regression
+
+    @functools.cached_property
+    def regression(self) -> Regression:
+        """All rows, or as few that have the same sums of squares."""
+        return folded(self.parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Some of many rows, each as likely as any other: those with the least of random numbers."""
+
+    rows: tuple[Regression, ...] = ()
+    luck: ndarray = field(default_factory=lambda: np.zeros(0))
+    seen: int = 0
+
+    def and_some_of(self, piece: Regression) -> _Drawn:
+        """Return some of these rows and those of a piece."""
+        luck = np.append(self.luck, np.random.default_rng(self.seen).uniform(size=len(piece.target)))
+        rows, seen = (*self.rows, piece), self.seen + len(piece.target)
+        if len(luck) <= MOST_KEPT:
+            return _Drawn(rows, luck, seen)
+        both = _joined(rows)
+        kept = np.sort(np.argpartition(luck, MOST_KEPT)[:MOST_KEPT])
+        return _Drawn((Regression(both.design[kept], both.target[kept]),), luck[kept], seen)
+
+    @property
+    def regression(self) -> Regression:
+        return _joined(self.rows)
+
+
+def _joined(rows: Sequence[Regression]) -> Regression:
+    """Return the rows of several regressions as one."""
+    return Regression(np.concatenate([one.design for one in rows]), np.concatenate([one.target for one in rows]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +151,7 @@ def options(kind: str, step: float) -> list[dict[str, Any]]:
 
 
 def derivative_rows(
-    data: Sequence[Samples], library: Library, order: int, kind: str, given: Mapping[str, Any]
+    data: Sequence[Samples], library: Library, order: int, kind: str, given: Mapping[str, Any], parts: int = 1
 ) -> DerivativeRows:
     """Make the rows of one differentiation.
 
@@ -127,31 +163,34 @@ def derivative_rows(
         order: of the time derivative.
         kind: of differentiation.
         given: its options.
+        parts: of a trajectory, whose rows are kept apart.
 
     Raises:
         InputError: it can take no trajectory.
     """
-    pieces, places = [], []
+    sums: list[Regression | None] = [None] * parts
+    drawn = _Drawn()
     reason: InputError | None = None
     for samples in data:
+        own, some = list(sums), drawn
         try:
-            own = list(row_pieces([samples], library, order, kind, given))
+            for piece in row_pieces([samples], library, order, kind, given):
+                # Rows are in the order of part, time, site.
+                length = max(len(piece.target) // (1 + samples.is_complex), 1)
+                place = np.arange(len(piece.target)) % length / length
+                for part in range(parts):
+                    there = (place * parts).astype(int) == part
+                    rows = Regression(piece.design[there], piece.target[there], piece.left_out * (part == 0))
+                    own[part] = joined(own[part], rows)
+                some = some.and_some_of(piece)
         except InputError as error:
             reason = error
             continue
-        for piece in own:
-            # Rows are in the order of part, time, site.
-            length = len(piece.target) // (1 + samples.is_complex)
-            pieces.append(piece)
-            places.append(np.arange(len(piece.target)) % max(length, 1) / max(length, 1))
-    if not pieces:
+        sums, drawn = own, some
+    if not any(sums):
         raise reason or InputError("there are no samples to fit")
-    whole = Regression(
-        np.concatenate([piece.design for piece in pieces]),
-        np.concatenate([piece.target for piece in pieces]),
-        sum(piece.left_out for piece in pieces),
-    )
-    return DerivativeRows(f"{kind} {given}" if given else kind, whole, np.concatenate(places))
+    kept = tuple(one for one in sums if one is not None)
+    return DerivativeRows(f"{kind} {given}" if given else kind, kept, drawn.regression)
 
 
 def path(
@@ -184,7 +223,7 @@ def path(
     found = []
     for threshold in thresholds:
         # The relaxation that has with few rows the effect of 1 with all.
-        nu = len(regression.target) / len(small.target)
+        nu = regression.size / small.size
         given = {"reg_weight_lam": threshold**2 / (2 * nu), "relax_coeff_nu": nu, "max_iter": 1000, "tol": 1e-8}
         shares = fitted_optimizer(small, "SR3", {"regularizer": "L0", **given}, seed).coef_
         found.append((threshold, small.least_squares(np.ravel(shares) != 0)))
@@ -248,7 +287,7 @@ class SINDyTuned:
         Raises:
             InputError: no differentiation can take the data, or there are too few samples.
         """
-        judge = integrate_equation(data, library, order, self.span)
+        judge = integrate_equation(data, library, order, self.span, self._parts)
         models = self.search(data, library, order, seed)
         scores = self._scores(models, judge)
         number = int(np.nanargmin(scores))
@@ -262,6 +301,10 @@ class SINDyTuned:
         status = own.status if np.any(best.support) else "every term was dropped; lower the thresholds"
         residual = own.residual(best.coefficients)
         return Fit(self.name, library, order, best.coefficients, residual, status=status, found=found)
+
+    @property
+    def _parts(self) -> int:
+        return self.folds if self.criterion == "cv" else 1
 
     def search(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> list[SparseModel]:
         """Run the optimisers on each differentiation; a support is listed once for each, but for bagged models.
@@ -279,7 +322,7 @@ class SINDyTuned:
                 continue
             for given in options(kind, step):
                 try:
-                    models += self._models(derivative_rows(data, library, order, kind, given), seed)
+                    models += self._models(derivative_rows(data, library, order, kind, given, self._parts), seed)
                 except InputError as error:
                     reason = error
         if not models:
@@ -294,7 +337,8 @@ class SINDyTuned:
             found = []
             # FROLS refuses dependent terms; the others go on.
             with contextlib.suppress(InputError):
-                found = path(own.regression, optimizer, self.thresholds, self.models, seed)
+                rows = own.drawn if optimizer == "ensemble" else own.regression
+                found = path(rows, optimizer, self.thresholds, self.models, seed)
             for knob, coefficients in found:
                 support = (coefficients != 0).tobytes()
                 if optimizer == "ensemble" or support not in listed:
@@ -310,23 +354,18 @@ class SINDyTuned:
             return judge.bic([one.coefficients for one in models], self.price)
         terms = np.array([np.sum(one.support) for one in models])
         lost = np.array([one.rows.regression.residual(one.coefficients) ** 2 for one in models])
-        return information_criterion(lost, np.array([len(one.rows.place) for one in models]), terms, self.price)
+        return information_criterion(lost, np.array([one.rows.regression.size for one in models]), terms, self.price)
 
     def _held_out(self, models: Sequence[SparseModel], judge: IntegratedEquation) -> Float[ndarray, " model"]:
         """Return the mean square of each model in each part of the record, its support refitted on the other parts."""
         total = np.zeros(len(models))
-        held = (judge.place * self.folds).astype(int)
         for own in {id(one.rows): one.rows for one in models}.values():
-            part = (own.place * self.folds).astype(int)
             members = [number for number, one in enumerate(models) if one.rows is own]
-            for fold in range(self.folds):
-                rest = part != fold
-                if not np.any(rest):
-                    continue
-                kept = triangular(Regression(own.regression.design[rest], own.regression.target[rest]))
+            for fold in range(len(own.parts) if len(own.parts) > 1 else 0):
+                kept = triangular(folded(part for number, part in enumerate(own.parts) if number != fold))
                 refitted = np.array([kept.least_squares(models[number].support) for number in members])
-                total[members] += judge.lost(refitted, held == fold)
-        return total / len(held)
+                total[members] += judge.lost(refitted, fold)
+        return total / judge.regression.size
 
 
 METHODS = (SINDyTuned,)

@@ -66,7 +66,7 @@ class Weak:
     @property
     def abilities(self) -> Abilities:
         """The method takes complex fields, inputs, uneven times and missing values."""
-        return Abilities(missing=True, memory=500, loads=("scipy.interpolate", "scipy.linalg", "sympy", "pysindy"))
+        return Abilities(missing=True, loads=("scipy.interpolate", "scipy.linalg", "sympy", "pysindy"))
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Estimate all coefficients, select terms, and estimate the coefficients of those again.
@@ -111,11 +111,12 @@ class Weak:
 
 def _residual(forms: Sequence[WeakForm], coefficients: ndarray) -> float:
     """Return the RMS of what the equation leaves of the weak derivative on the observed states, relative to its RMS."""
-    rows = [form.rows(form.state.seen) for form in forms]
-    target = np.concatenate([target.ravel() for target, _ in rows])
-    left = target - np.concatenate([(design @ coefficients).ravel() for _, design in rows])
-    height = float(np.sqrt(np.mean(target**2)))
-    return float(np.sqrt(np.mean(left**2))) / (height or 1.0)
+    left, whole = 0.0, 0.0
+    for form in forms:
+        for rows in form.pieces(form.state.seen):
+            left += float(np.sum((rows[:, -1] - rows[:, :-1] @ coefficients) ** 2))
+            whole += float(np.sum(rows[:, -1] ** 2))
+    return float(np.sqrt(left / (whole or 1.0)))
 
 
 METHODS = (Weak,)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -28,14 +28,15 @@ from annotated_types import Ge, Le, Lt
 
 from latticebench.methods.engine.bounds import SOME, Count, Positive
 from latticebench.methods.engine.inputs import inputs
-from latticebench.methods.engine.integrated_equation import integrate_equation, smooth_curves
-from latticebench.methods.engine.regression import Regression
+from latticebench.methods.engine.integrated_equation import Curves, integrate_equation, smooth_curves
+from latticebench.methods.engine.regression import Regression, folded
 from latticebench.methods.engine.sparse import THRESHOLDS, seeded, stlsq_path
 from latticebench.methods.method import Abilities, Fit
+from latticebench.systems.arrays import PIECE
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
-from latticebench.systems.stencil import evaluate, observed
+from latticebench.systems.stencil import Stencil, Window, evaluate
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -137,43 +138,74 @@ class WeakSTLSQ:
         Raises:
             InputError: there are too few samples, or a term is not finite.
         """
-        designs, targets = [], []
-        for samples in data:
-            t, values, field, derivative = _series(samples, library, order, finer)
-            half = max(width * (t[-1] - t[0]), FEWEST * float(np.max(np.diff(t))))
-            if half >= (t[-1] - t[0]) / 2:
-                raise InputError(f"{samples.source}: too few samples for a window, there are {len(samples.t)}")
-            parts, terms, _, sites = values.shape
+        return folded(piece for samples in data for piece in self._pieces(samples, library, order, finer, width, seed))
+
+    def _pieces(
+        self, samples: Samples, library: Library, order: int, finer: int, width: float, seed: int
+    ) -> Iterator[Regression]:
+        """Yield the rows of one trajectory, of some sites after others; the windows are the same at all sites."""
+        course = _Course.of(samples, order, finer)
+        t = course.t
+        half = max(width * (t[-1] - t[0]), FEWEST * float(np.max(np.diff(t))))
+        if half >= (t[-1] - t[0]) / 2:
+            raise InputError(f"{samples.source}: too few samples for a window, there are {len(samples.t)}")
+        most = max(1, PIECE // (len(t) * len(library.terms) * (1 + samples.is_complex)))
+        for sites in Stencil.chain(samples.sites, library.reach, samples.ends).windows(most):
+            values, field = course.series(library, sites)
+            parts, terms, _, count = values.shape
             columns = np.concatenate([values.transpose(2, 0, 3, 1).reshape(len(t), -1), field], axis=1)
             if not np.all(np.isfinite(columns)):
                 raise InputError(f"{samples.source}: a term of the library is not finite on the samples")
             with seeded(seed):
-                integral, slope = integrals(t, columns, derivative, half, self.domains, self.power)
-            count = parts * sites
-            designs.append(integral[:, :-count].reshape(-1, terms))
-            targets.append(slope[:, -count:].ravel())
-        return Regression(np.concatenate(designs), np.concatenate(targets))
+                integral, slope = integrals(t, columns, course.derivative, half, self.domains, self.power)
+            own = parts * count
+            yield Regression(integral[:, :-own].reshape(-1, terms), slope[:, -own:].ravel())
 
 
-def _series(samples: Samples, library: Library, order: int, finer: int) -> tuple[ndarray, ndarray, ndarray, int]:
-    """Return times, the terms (parts, terms, time, sites), the field (time, parts * sites), and its derivative's order.
+@dataclass(frozen=True, eq=False)
+class _Course:
+    """The field of one trajectory on the samples, or on a finer grid along a smoothing spline.
 
-    Both are on the samples, or on a finer grid along a smoothing spline.
+    Attributes:
+        samples: the trajectory.
+        order: of the time derivative.
+        finer: points of the grid in each interval between samples.
+        t: the grid.
+        u, v: curves of some sites; v is None where the field is u.
     """
-    steps = np.linspace(0, len(samples.t) - 1, (len(samples.t) - 1) * finer + 1)
-    t = np.interp(steps, np.arange(len(samples.t)), samples.t)
-    curves = smooth_curves(samples, samples.u)
-    u = samples.u if finer == 1 else curves[0](t)
-    v = curves[1](t) if order == 2 else None
-    field, derivative = u, order
-    if order == 2 and samples.v is not None:
-        v = samples.v if finer == 1 else smooth_curves(samples, samples.v)[0](t)
-        field, derivative = v, 1
-    f = None if samples.f is None or not library.uses("f") else inputs(samples, t)
-    values = evaluate(library.terms, u, v, f, t, ends=samples.ends)
-    inner = field[:, observed(samples.sites, library.reach, samples.ends)]
-    parts = np.concatenate([inner.real, inner.imag], axis=1) if samples.is_complex else inner
-    return t, values, parts, derivative
+
+    samples: Samples
+    order: int
+    finer: int
+    t: Float[ndarray, " grid"]
+    u: Curves
+    v: Curves | None
+
+    @classmethod
+    def of(cls, samples: Samples, order: int, finer: int) -> _Course:
+        steps = np.linspace(0, len(samples.t) - 1, (len(samples.t) - 1) * finer + 1)
+        t = np.interp(steps, np.arange(len(samples.t)), samples.t)
+        velocity = smooth_curves(samples, samples.v) if order == 2 and samples.v is not None else None
+        return cls(samples, order, finer, t, smooth_curves(samples, samples.u), velocity)
+
+    @property
+    def derivative(self) -> int:
+        """The order of the field's derivative in the equation."""
+        return self.order if self.v is None else 1
+
+    def series(self, library: Library, sites: Window) -> tuple[ndarray, ndarray]:
+        """Return the terms (parts, terms, grid, sites) and the field (grid, parts * sites) at some sites."""
+        samples, t, some = self.samples, self.t, sites.columns
+        curves = self.u(some)
+        u = samples.u[:, some] if self.finer == 1 else curves[0](t)
+        v = curves[1](t) if self.order == 2 else None
+        field = u
+        if self.v is not None and samples.v is not None:
+            field = v = samples.v[:, some] if self.finer == 1 else self.v(some)[0](t)
+        f = None if samples.f is None or not library.uses("f") else inputs(samples, t, some)
+        values = evaluate(library.terms, u, v, f, t, ends=samples.ends, reach=library.reach, window=sites)
+        inner = np.asarray(field)[:, sites.own]
+        return values, np.concatenate([inner.real, inner.imag], axis=1) if samples.is_complex else inner
 
 
 METHODS = (WeakSTLSQ,)

@@ -254,7 +254,7 @@ class _Triangle:
 
     def __init__(self, columns: int) -> None:
         self.columns = columns
-        self.kept: list[ndarray] = []
+        self.kept = [np.empty((0, columns + 1))]
         self.waiting = 0
         # The rows of each number when it was last seen.
         self.last: Any = 0.0

@@ -5,9 +5,9 @@
 The right-hand side is linear in the coefficients xi, so the values of the terms are its derivatives by them. The
 derivatives by the state come from the term language and are exact.
 
-Dry friction, sign(v), jumps where a site turns round and holds a site that is at rest. It counts as its mean over one
-step of the integrator (`Dynamics.linear`), so that it can be integrated and derived; the mean becomes the jump as the
-steps get shorter.
+Dry friction, sign(v), jumps where a site turns round and holds a site that is at rest. So that it can be integrated and
+derived, it counts as viscous below a speed that is chosen, or as its mean over one step of the integrator, which
+becomes the jump as the steps get shorter (`Dynamics.linear`).
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ class Dynamics:
             (parts, B, N). The term 1 (1+i for a complex field) with a factor is an arbitrary known force.
         least_reach: least width of the stencil to the left and to the right. With it, equations of different terms
             leave the same sites without an equation at unknown ends.
+        rest: speed below which dry friction is viscous; 0 to take its mean over a step.
     """
 
     terms: tuple[Term, ...]
@@ -60,6 +61,7 @@ class Dynamics:
     weights: Float[ndarray, "terms sites"] | None = None
     factors: tuple[Factor | None, ...] | None = None
     least_reach: tuple[int, int] = (0, 0)
+    rest: float = 0.0
 
     @functools.cached_property
     def reach(self) -> tuple[int, int]:
@@ -120,7 +122,7 @@ class Dynamics:
         acceleration by all other terms and of the friction's own. Where a site turns round, this is about the mean of
         sign(v) over the step. Where a site is at rest, it is a friction that stops the site within a step and holds it
         against any smaller acceleration (as in Moreau's time stepping, Nonsmooth Mechanics and Applications (1988)).
-        Derivatives keep b fixed.
+        Derivatives keep b fixed. Where `rest` is given, it is tanh(v / rest) instead.
 
         Args:
             coefficients: xi.
@@ -241,7 +243,7 @@ class Dynamics:
         factors: dict[int, ndarray],
         derivatives: bool,
     ) -> dict[tuple[int, Slot], ndarray]:
-        """Replace dry friction in `values` by its mean over a step, and return its derivative by v."""
+        """Replace dry friction in `values` by one without a jump, and return its derivative by v."""
         others = np.delete(np.arange(len(self.terms)), self._rubbing)
         push = np.abs(np.tensordot(coefficients[others], values[0, others], (0, 0)))
         total = np.zeros_like(v)
@@ -249,9 +251,8 @@ class Dynamics:
             size = np.ones_like(v) if self.weights is None else self.weights[term, self.moving] * np.ones_like(v)
             if term in factors:
                 size = size * factors[term][0]
-            width = np.maximum(
-                step[:, None] / 2 * np.maximum(push, np.abs(coefficients[term] * size)), np.finfo(float).tiny
-            )
+            over_a_step = step[:, None] / 2 * np.maximum(push, np.abs(coefficients[term] * size))
+            width = self.rest or np.maximum(over_a_step, np.finfo(float).tiny)
             soft = np.tanh(v / width)
             values[0, term] = size * soft
             if derivatives:

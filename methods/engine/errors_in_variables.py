@@ -12,15 +12,18 @@ Bayesian information criterion (Chen & Chen, Biometrika 95, 759 (2008)) decides 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.methods.engine.regression import Regression
+from latticebench.methods.engine.regression import Regression, folded
 from latticebench.methods.engine.scaled import Scaled
-from latticebench.methods.engine.weak_form import ACCURACY, WeakForm, linearised
+from latticebench.methods.engine.weak_covariance import Sweep
+from latticebench.methods.engine.weak_form import ACCURACY, WeakForm
+from latticebench.systems.arrays import empty, rows_of
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,9 +44,9 @@ class Estimate:
     Attributes:
         coefficients: (terms,); 0 outside the support.
         stderr: their standard errors, widened where the residual is larger than the noise explains.
-        regression: the whitened rows of all terms.
+        regression: the whitened rows of all terms, or as few that have the same sums of squares.
         chi2: mean square of the whitened residual, about 1 when the equation holds and the noise is known.
-        states: w of each trajectory.
+        sweeps: the linearised equations of each trajectory that they come from.
         rounds: how many times the terms were evaluated.
         settled: whether the coefficients stopped changing.
     """
@@ -52,9 +55,14 @@ class Estimate:
     stderr: Float[ndarray, " terms"]
     regression: Regression
     chi2: float
-    states: tuple[Float[ndarray, "channels coefficients"], ...]
+    sweeps: tuple[Sweep, ...]
     rounds: int
     settled: bool
+
+    @functools.cached_property
+    def states(self) -> tuple[Float[ndarray, "channels coefficients"], ...]:
+        """The state w of each trajectory that goes with the coefficients."""
+        return tuple(sweep.nearest(self.coefficients) for sweep in self.sweeps)
 
 
 def estimate(
@@ -83,24 +91,23 @@ def estimate(
     if start is not None:
         return _iterate(forms, support, rounds, np.where(support, start.coefficients, 0.0), start.states)
     seen = tuple(form.state.seen for form in forms)
-    rows = np.concatenate([_joined(form, form.state.seen) for form in forms])
-    if not np.all(np.isfinite(rows)):
-        raise InputError(f"{forms[0].samples.source}: the weak form fails: a term is not finite on the data")
-    found = _iterate(forms, support, rounds, Regression(rows[:, :-1], rows[:, -1]).least_squares(support), seen)
+    first = folded(_checked(forms)).least_squares(support)
+    found = _iterate(forms, support, rounds, first, seen)
     if found.settled and found.chi2 < SUSPECT:
         return found
-    first = _total(forms, support, seed)
-    if first is None:
+    second = _total(forms, support, seed)
+    if second is None:
         return found
-    other = _iterate(forms, support, rounds, first, seen)
+    other = _iterate(forms, support, rounds, second, seen)
     return max(found, other, key=lambda one: (one.settled, -abs(np.log(max(one.chi2, 1e-300)))))
 
 
 def _iterate(
     forms: Sequence[WeakForm], support: ndarray, rounds: int, coefficients: ndarray, states: Sequence[ndarray]
 ) -> Estimate:
-    target = np.concatenate([form.rows(form.state.seen)[0].ravel() for form in forms])
-    accuracy = ACCURACY * (float(np.sqrt(np.mean(target**2))) or 1.0)
+    sizes = [len(form.sites) * form.parts * form.count for form in forms]
+    height = np.sqrt(np.average([form.height**2 for form in forms], weights=sizes))
+    accuracy = ACCURACY * (float(height) or 1.0)
     best: Estimate | None = None
     for number in range(1, rounds + 1):
         try:
@@ -116,7 +123,9 @@ def _iterate(
             best = now
         if np.all(step <= tolerance):
             return replace(best, settled=True)
-        coefficients, states = now.coefficients, now.states
+        coefficients = now.coefficients
+        if number < rounds:
+            states = now.states
     assert best is not None
     return best
 
@@ -133,19 +142,22 @@ def _total(forms: Sequence[WeakForm], support: ndarray, seed: int) -> ndarray | 
 
     draw = np.random.default_rng(seed)
     columns = np.append(np.flatnonzero(support), len(support))
-    parts, changes = [], []
+    gram, noise = np.zeros((2, len(columns), len(columns)))
     for form in forms:
-        seen = _joined(form, form.state.seen)[:, columns]
-        parts.append(seen)
+        for rows in form.pieces(form.state.seen):
+            gram += rows[:, columns].T @ rows[:, columns]
+        noisy = empty(form.state.seen.shape)
         for _ in range(DRAWS):
-            noisy = form.state.seen + draw.normal(size=form.state.seen.shape)
-            changes.append(_joined(form, noisy)[:, columns] - seen)
-    rows, noise = np.concatenate(parts), np.concatenate(changes)
-    scale = np.linalg.norm(rows, axis=0)
+            for some in rows_of(noisy):
+                noisy[some] = form.state.seen[some] + draw.normal(size=noisy[some].shape)
+            for rows, other in zip(form.pieces(form.state.seen), form.pieces(noisy), strict=True):
+                change = (other - rows)[:, columns]
+                noise += change.T @ change / DRAWS
+    scale = np.sqrt(np.diag(gram))
     scale = np.where(scale > 0, scale, 1.0)
+    across = np.outer(scale, scale)
     try:
-        gram = (noise / scale).T @ (noise / scale) / DRAWS
-        _, modes = scipy.linalg.eigh((rows / scale).T @ (rows / scale), gram, subset_by_index=[0, 0])
+        _, modes = scipy.linalg.eigh(gram / across, noise / across, subset_by_index=[0, 0])
     except (np.linalg.LinAlgError, ValueError):
         return None
     least = modes[:, 0] / scale
@@ -156,11 +168,13 @@ def _total(forms: Sequence[WeakForm], support: ndarray, seed: int) -> ndarray | 
     return full
 
 
-def _joined(form: WeakForm, w: ndarray) -> ndarray:
-    """Return rows of the integrals of the terms and, in the last column, of the derivative."""
-    with np.errstate(all="ignore"):
-        target, design = form.rows(w)
-    return np.column_stack([design.reshape(target.size, -1), target.ravel()])
+def _checked(forms: Sequence[WeakForm]) -> Iterator[Regression]:
+    """Yield the rows of the integrals on the observed states."""
+    for form in forms:
+        for rows in form.pieces(form.state.seen):
+            if not np.all(np.isfinite(rows)):
+                raise InputError(f"{form.samples.source}: the weak form fails: a term is not finite on the data")
+            yield Regression(rows[:, :-1], rows[:, -1])
 
 
 def _round(
@@ -171,27 +185,15 @@ def _round(
     accuracy: float,
     number: int,
 ) -> Estimate:
-    """Linearise about the states and coefficients, solve for the coefficients, and update the states."""
-    designs, targets, pieces = [], [], []
-    for form, w in zip(forms, states, strict=True):
-        target, design, slopes, covariance = linearised(form, w, coefficients, accuracy)
-        designs.append(covariance.whiten(design))
-        targets.append(covariance.whiten(target)[:, 0])
-        pieces.append((form, slopes, covariance, target, design))
-    regression = Regression(np.concatenate(designs), np.concatenate(targets))
+    """Linearise about the states and coefficients, and solve for the coefficients."""
+    sweeps = tuple(Sweep(form, w, coefficients, accuracy) for form, w in zip(forms, states, strict=True))
+    regression = folded(sweep.rows() for sweep in sweeps)
     found = regression.least_squares(support)
     left = regression.target - regression.design @ found
-    chi2 = float(np.sum(left**2) / max(len(left) - np.sum(support), 1))
-    moved_states = []
-    for form, slopes, covariance, target, design in pieces:
-        pull = covariance.solve(target - design @ found)
-        w = form.state.seen.copy()
-        for slope in slopes:
-            w[slope.channel] -= slope.matrix.T @ pull[slope.equations].ravel()
-        moved_states.append(w)
+    chi2 = float(np.sum(left**2) / max(regression.size - np.sum(support), 1))
     stderr = np.zeros(len(found))
     stderr[support] = Scaled.of(regression.design[:, support]).stderr() * np.sqrt(max(chi2, 1.0))
-    return Estimate(found, stderr, regression, chi2, tuple(moved_states), number, settled=False)
+    return Estimate(found, stderr, regression, chi2, sweeps, number, settled=False)
 
 
 def eliminate(
@@ -209,8 +211,8 @@ def eliminate(
         gamma: 0 for the Bayesian information criterion, 1 for its extension to large libraries.
     """
     design, target = regression.design, regression.target
-    rows, terms = design.shape
-    price = np.log(rows) + 2 * gamma * np.log(terms)
+    terms = design.shape[1]
+    price = np.log(regression.size) + 2 * gamma * np.log(terms)
     # The triangular factor has the same sums of squares in few rows.
     scale = np.linalg.norm(design, axis=0)
     scaled = np.column_stack([design / np.where(scale > 0, scale, 1.0), target])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -110,18 +111,18 @@ def folded(pieces: Iterable[Regression]) -> Regression:
     All that depends on A and y by way of |y - A xi| is the same for the factor as for the rows: least squares on any
     support, and so STLSQ, SR3, SSR and FROLS.
     """
-    whole: Regression | None = None
-    for piece in pieces:
-        if whole is None:
-            whole = piece
-            continue
-        both = Regression(
-            np.concatenate([triangular(whole).design, piece.design]),
-            np.concatenate([triangular(whole).target, piece.target]),
-        )
-        whole = replace(triangular(both), left_out=whole.left_out + piece.left_out, count=whole.size + piece.size)
+    whole = functools.reduce(joined, pieces, None)
     assert whole is not None
     return whole
+
+
+def joined(whole: Regression | None, piece: Regression) -> Regression:
+    """Return one regression with the sums of two; the piece itself where there is nothing yet."""
+    if whole is None:
+        return piece
+    first = triangular(whole)
+    both = Regression(np.concatenate([first.design, piece.design]), np.concatenate([first.target, piece.target]))
+    return replace(triangular(both), left_out=whole.left_out + piece.left_out, count=whole.size + piece.size)
 
 
 def rows(

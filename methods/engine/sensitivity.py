@@ -89,7 +89,7 @@ class Stretches:
         """Whether both can be integrated as one: they follow one equation, without inputs or a drive."""
         one, two = self.dynamics, other.dynamics
         outside = (self.inputs, self.drive, other.inputs, other.drive)
-        same = ("terms", "order", "is_complex", "sites", "ends", "least_reach", "factors")
+        same = ("terms", "order", "is_complex", "sites", "ends", "least_reach", "rest", "factors")
         return (
             all(given is None for given in outside)
             and all(getattr(one, name) == getattr(two, name) for name in same)
@@ -141,16 +141,19 @@ class Stretches:
         start: Float[ndarray, "stretch state"],
         tolerance: float | Float[ndarray, " state"] | Float[ndarray, "stretch state"],
         splines: ndarray | None = None,
+        most: int | Int[ndarray, " stretch"] = MAX_SUBSTEPS,
+        least: Int[ndarray, " stretch"] | None = None,
     ) -> Int[ndarray, " stretch"]:
-        """Return how many steps each stretch needs.
+        """Return how many steps each stretch needs, from `least` (1 if None) to at most `most` times as many.
 
         Steps are halved until no number of the end moves by more than its tolerance.
         """
         tolerance = np.broadcast_to(tolerance, start.shape)
-        needed = np.ones(len(start), dtype=int)
-        open_ = np.arange(len(start))
-        coarse = self.run(coefficients, start, needed, splines)
-        while len(open_) and needed[open_[0]] < MAX_SUBSTEPS:
+        needed = np.ones(len(start), dtype=int) if least is None else least.copy()
+        most, times = np.broadcast_to(most, len(start)), 1
+        open_ = np.flatnonzero(most > 1)
+        coarse = self.run(coefficients, start, needed, splines)[open_]
+        while len(open_):
             part = replace(self, begin=self.begin[open_], end=self.end[open_])
             fine = part.run(coefficients, start[open_], 2 * needed[open_], splines)
             with np.errstate(all="ignore"):
@@ -159,6 +162,9 @@ class Stretches:
                 wrong = ~np.all(np.abs(fine - coarse) <= tolerance[open_], axis=1) & ~lost
             open_, coarse = open_[wrong], fine[wrong]
             needed[open_] *= 2
+            times *= 2
+            more = most[open_] > times
+            open_, coarse = open_[more], coarse[more]
         return needed
 
     def vary(

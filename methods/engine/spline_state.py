@@ -4,18 +4,22 @@ The series of each site is a spline of degree 9. Generalised cross-validation ov
 that the data can bear: at their spacing the spectrum of the data sinks into the noise. Where the velocity was observed,
 u = B c and v = B' c are fitted together, each weighted by its noise; otherwise v = B' c follows from u. The noise of u
 and of v is estimated from what the splines leave. Times may be uneven and have gaps.
+
+Sites are gone through some at a time. What cross-validation asks of many sites without gaps, sums of squares, is asked
+of the triangular factor of all their series, which has the same.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from latticebench.methods.engine.bsplines import BSplines
+from latticebench.systems.arrays import empty, pieces
 from latticebench.systems.errors import InputError
 from latticebench.systems.samples import Samples
 
@@ -45,7 +49,7 @@ class SplineState:
 
     Attributes:
         seen: w as the samples give it (channels, coefficients).
-        factors: one matrix per channel (coefficients, coefficients).
+        factors: one matrix per channel, or one for all (channels or 1, coefficients, coefficients).
         knots: of the spline.
         degree: of the spline.
         intervals: how many knot intervals cross-validation asked for.
@@ -55,7 +59,7 @@ class SplineState:
     """
 
     seen: Float[ndarray, "channels coefficients"]
-    factors: tuple[Float[ndarray, "coefficients coefficients"], ...]
+    factors: Float[ndarray, "matrices coefficients coefficients"]
     knots: Float[ndarray, " knots"]
     degree: int
     intervals: int
@@ -63,14 +67,91 @@ class SplineState:
     size: float
     whole: Bool[ndarray, " sites"]
 
+    def factor(self, channels: ndarray) -> Float[ndarray, "*channels coefficients coefficients"]:
+        """Return the factors of some channels, or the one of all as an array that stands for as many."""
+        if len(self.factors) > 1:
+            return np.asarray(self.factors[channels])
+        return np.broadcast_to(self.factors[0], (*np.shape(channels), *self.factors.shape[1:]))
+
     def basis(self, t: Float[ndarray, " time"], derivative: int) -> Float[ndarray, "time coefficients"]:
         """Evaluate all B-splines, or a derivative of them."""
         return BSplines(self.knots, self.degree).design(t, derivative)
 
 
 @dataclass(frozen=True, eq=False)
+class _Series:
+    """The real series of all channels: of u and, where it is used, of v.
+
+    Attributes:
+        fields: of each quantity, as observed (T, N).
+        counts: how many values of each channel are known.
+        tidy: whether none is missing.
+    """
+
+    fields: tuple[ndarray, ...]
+    counts: ndarray
+    tidy: bool
+
+    @classmethod
+    def of(cls, samples: Samples, order: int) -> _Series:
+        fields = (samples.u,) if samples.v is None or order == 1 else (samples.u, samples.v)
+        parts, whole = 1 + samples.is_complex, cls(fields, np.zeros(0), tidy=False)
+        counts = np.empty((len(fields), samples.sites * parts), int)
+        for some in whole.pieces():
+            counts[:, some] = [np.sum(~np.isnan(one), axis=0) for one in whole.at(some)]
+        return cls(fields, counts, samples.is_even and not samples.has_missing)
+
+    @property
+    def parts(self) -> int:
+        return 1 + int(np.iscomplexobj(self.fields[0]))
+
+    @property
+    def channels(self) -> int:
+        return int(self.fields[0].shape[1]) * self.parts
+
+    def pieces(self) -> Iterator[slice]:
+        """Go through the channels, whole sites at a time."""
+        for some in pieces(self.fields[0].shape[1], len(self.fields[0]) * self.parts * len(self.fields)):
+            yield slice(some.start * self.parts, some.stop * self.parts)
+
+    def at(self, some: slice) -> list[ndarray]:
+        """Return the series of some channels, site by site (T, channels)."""
+        sites = slice(some.start // self.parts, some.stop // self.parts)
+        found = []
+        for field in self.fields:
+            own = np.asarray(field[:, sites])
+            found.append(own if self.parts == 1 else np.stack([own.real, own.imag], axis=-1).reshape(len(own), -1))
+        return found
+
+    def few(self) -> list[ndarray]:
+        """Return series that choose the number of knots as all of them do."""
+        if not self.tidy:
+            # A few channels are enough; each may have gaps, and so a factorisation, of its own.
+            channels = np.unique(np.linspace(0, self.channels - 1, CHANNELS).round().astype(int))
+            both = [self.at(slice(one - one % self.parts, one - one % self.parts + self.parts)) for one in channels]
+            kept = [one % self.parts for one in channels]
+            return [
+                np.stack([one[number][:, k] for one, k in zip(both, kept, strict=True)], axis=1)
+                for number in range(len(self.fields))
+            ]
+        times = len(self.fields[0])
+        triangle: ndarray | None = None
+        for some in self.pieces():
+            rows = np.concatenate(self.at(some)).T
+            stacked = rows if triangle is None else np.concatenate([triangle, rows])
+            triangle = stacked if len(stacked) <= stacked.shape[1] else np.asarray(np.linalg.qr(stacked, mode="r"))
+        assert triangle is not None
+        return [triangle[:, k * times : (k + 1) * times].T for k in range(len(self.fields))]
+
+    def size(self, number: int) -> float:
+        """Return the RMS of the known values of u or v."""
+        total = sum(float(np.nansum(self.at(some)[number] ** 2)) for some in self.pieces())
+        return float(np.sqrt(total / max(np.sum(self.counts[number]), 1)))
+
+
+@dataclass(frozen=True, eq=False)
 class _SplineFit:
-    """Least squares of all channels on one spline basis."""
+    """Least squares of some channels on one spline basis: w, the triangles of each, and what is left of how many."""
 
     seen: ndarray
     triangles: tuple[ndarray, ...]
@@ -81,11 +162,6 @@ class _SplineFit:
     def score(self) -> float:
         """The logarithm of generalised cross-validation (Craven & Wahba 1979), up to a constant."""
         return float(np.log(max(self.squares, 1e-300)) - 2 * np.log(self.left))
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of what is left."""
-        return float(np.sqrt(self.squares / self.left))
 
 
 def estimate_state(samples: Samples, order: int) -> SplineState:
@@ -102,70 +178,65 @@ def estimate_state(samples: Samples, order: int) -> SplineState:
     if len(t) < MIN_SAMPLES:
         raise InputError(f"{samples.source}: the weak form needs at least {MIN_SAMPLES} samples, there are {len(t)}")
     degree = min(DEGREE, len(t) - 3)
-    fields = [_channels(samples.u)]
-    if samples.v is not None and order == 2:
-        fields.append(_channels(samples.v))
-    tidy = samples.is_even and not samples.has_missing
+    series = _Series.of(samples, order)
+    few = series.few()
+    # Where few stand for all, what is left of them is left of all.
+    share = series.channels / few[0].shape[1] if series.tidy else 1.0
+    most = int(np.median(np.sum(series.counts, axis=0)))
     noise = []
-    for field in fields:
-        _, alone = _cross_validated(t, [field], [1.0], degree, tidy)
-        noise.append(max(alone.noise, 1e-15 * _size(field), 1e-150))
+    for number, field in enumerate(few):
+        values = int(np.median(series.counts[number]))
+        _, alone = _cross_validated(t, [field], [1.0], degree, series.tidy, values)
+        noise.append(max(np.sqrt(alone.squares / alone.left / share), 1e-15 * series.size(number), 1e-150))
     weights = [1 / sigma for sigma in noise]
-    intervals, _ = _cross_validated(t, fields, weights, degree, tidy)
-    most = _most_intervals(fields, degree)
+    intervals, _ = _cross_validated(t, few, weights, degree, series.tidy, most)
     wanted = (max(FINENESS * intervals + 3, FEWEST), intervals + 3)
-    finer = next((number for number in wanted if number <= most), intervals)
-    fitted = _spline_fit(t, fields, weights, finer, degree, tidy)
-    count = len(fitted.seen[0])
-    inverse: dict[int, ndarray] = {}
-    for triangle in fitted.triangles:
-        if id(triangle) not in inverse:
-            inverse[id(triangle)] = np.linalg.solve(triangle, np.eye(count))
-    parts = 1 + samples.is_complex
+    bearable = _most_intervals(most, len(t), degree)
+    finer = next((number for number in wanted if number <= bearable), intervals)
+    seen, factors = _all_channels(t, series, weights, finer, degree)
     return SplineState(
-        fitted.seen,
-        tuple(inverse[id(triangle)] for triangle in fitted.triangles),
-        _basis(t, count - degree, degree).knots,
-        degree,
-        intervals,
-        (noise[0], noise[1] if len(noise) > 1 else float("nan")),
-        _size(fields[0]),
-        np.sum(~np.isnan(fields[0][:, ::parts]), axis=0) > degree,
-    )
+        seen, factors, _basis(t, finer, degree).knots, degree, intervals,
+        (float(noise[0]), float(noise[1]) if len(noise) > 1 else float("nan")),
+        series.size(0), series.counts[0, :: series.parts] > degree,
+    )  # fmt: skip
 
 
-def _channels(field: ndarray) -> ndarray:
-    """Write a field (T, N) as real channels (T, N * parts), site by site."""
-    if not np.iscomplexobj(field):
-        return field
-    return np.stack([field.real, field.imag], axis=-1).reshape(len(field), -1)
-
-
-def _size(field: ndarray) -> float:
-    return float(np.sqrt(np.nanmean(field**2))) if np.any(~np.isnan(field)) else 0.0
+def _all_channels(
+    t: ndarray, series: _Series, weights: Sequence[float], intervals: int, degree: int
+) -> tuple[ndarray, ndarray]:
+    """Return w and the factors of all channels."""
+    count = intervals + degree
+    seen = empty((series.channels, count))
+    alike = bool(np.all(series.counts == len(t)))
+    factors = empty((1 if alike else series.channels, count, count))
+    for some in series.pieces():
+        fitted = _spline_fit(t, series.at(some), weights, intervals, degree, series.tidy)
+        seen[some] = fitted.seen
+        inverse: dict[int, ndarray] = {}
+        for channel, triangle in enumerate(fitted.triangles[: len(factors)], start=some.start):
+            if id(triangle) not in inverse:
+                inverse[id(triangle)] = np.linalg.solve(triangle, np.eye(count))
+            factors[channel % len(factors)] = inverse[id(triangle)]
+    return seen, factors
 
 
 def _basis(t: ndarray, intervals: int, degree: int) -> BSplines:
     return BSplines.clamped(np.linspace(t[0], t[-1], intervals + 1), degree)
 
 
-def _most_intervals(fields: Sequence[ndarray], degree: int) -> int:
+def _most_intervals(values: int, times: int, degree: int) -> int:
     """Return the most knot intervals that leave a tenth of a typical channel's values for the estimate of the noise."""
-    values = float(np.median(sum(np.sum(~np.isnan(field), axis=0) for field in fields)))
-    return int(min(0.9 * values - degree, len(fields[0]), MAX_INTERVALS))
+    return int(min(0.9 * values - degree, times, MAX_INTERVALS))
 
 
 def _cross_validated(
-    t: ndarray, fields: Sequence[ndarray], weights: Sequence[float], degree: int, tidy: bool
+    t: ndarray, fields: Sequence[ndarray], weights: Sequence[float], degree: int, tidy: bool, values: int
 ) -> tuple[int, _SplineFit]:
     """Find the number of knot intervals with the least cross-validation score, in steps of an eighth."""
-    # A few channels are enough to choose; each may have gaps, and so a factorisation, of its own.
-    channels = np.unique(np.linspace(0, fields[0].shape[1] - 1, CHANNELS).round().astype(int))
-    shown = fields if tidy else [field[:, channels] for field in fields]
     best: tuple[int, _SplineFit] | None = None
     intervals = 1
-    while best is None or intervals <= min(_most_intervals(shown, degree), 4 * best[0] + 20):
-        fitted = _spline_fit(t, shown, weights, intervals, degree, tidy)
+    while best is None or intervals <= min(_most_intervals(values, len(t), degree), 4 * best[0] + 20):
+        fitted = _spline_fit(t, fields, weights, intervals, degree, tidy)
         if best is None or fitted.score < best[1].score:
             best = intervals, fitted
         intervals = max(intervals + 1, round(1.125 * intervals))

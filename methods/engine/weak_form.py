@@ -17,27 +17,31 @@ the constraint v = u', at half its size.
 To first order in the noise of the state, the residual of the weak equations is L(xi) (c_seen - c), where c are the
 coefficients of the spline and L follows from the derivatives of the terms; its covariance is L cov(c) L^T (WENDy:
 Bortz, Messenger & Dukic, Bull. Math. Biol. 85, 110 (2023)).
+
+Equations are made some sites at a time (`Block`), so that memory does not grow with the chain;
+`latticebench.methods.engine.weak_covariance` goes through the blocks.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from latticebench.methods.engine.inputs import inputs
 from latticebench.methods.engine.spline_state import estimate_state
-from latticebench.systems.compiler import partials
+from latticebench.systems.arrays import PIECE, rows_of
+from latticebench.systems.compiler import Slot, compiled, partials
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
-from latticebench.systems.stencil import Stencil, evaluate, numbers
+from latticebench.systems.stencil import Stencil, numbers
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float, Int
     from numpy import ndarray
 
 # Half the support of a test function in knot intervals, and its power p.
@@ -69,18 +73,45 @@ def bumps(
 
 
 @dataclass(frozen=True, eq=False)
-class Slope:
-    """The derivative of the residuals of some weak equations by the state of one channel.
+class Block:
+    """Some neighbouring sites with weak equations, in the order in which they share sites.
 
     Attributes:
-        channel: its number.
-        equations: numbers of the equations that depend on it.
-        matrix: the derivative by w (equations * tests, coefficients).
+        lead: how many of the sites are those that the block before ends with.
+        sites: the sites of the equations (M,).
+        columns: the sites that their terms read, increasing.
+        place: where among the columns each is that is read (offsets, M).
+        factor: by which it is multiplied (offsets, M).
     """
 
-    channel: int
-    equations: ndarray
-    matrix: ndarray
+    lead: int
+    sites: Int[ndarray, " sites"]
+    columns: Int[ndarray, " columns"]
+    place: Int[ndarray, "offsets sites"]
+    factor: Float[ndarray, "offsets sites"]
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """The derivatives of the residuals of a block's weak equations by the states of the channels that they read.
+
+    Attributes:
+        channel: numbers of the channels that each site's equations read (M, reads).
+        matrix: the derivatives by w of those (M, reads, parts, tests, coefficients).
+    """
+
+    channel: Int[ndarray, "sites reads"]
+    matrix: Float[ndarray, "sites reads parts tests coefficients"]
+
+    def moved(self, change: Float[ndarray, "sites reads coefficients"]) -> Float[ndarray, "equations tests"]:
+        """Return by how much the residuals move where the state of the channels does."""
+        found = np.matmul(self.matrix, change[:, :, None, :, None])[..., 0].sum(axis=1)
+        return np.asarray(found.reshape(-1, found.shape[-1]))
+
+    def draw(self, w: Float[ndarray, "channels coefficients"], pull: Float[ndarray, " rows"], lead: int) -> None:
+        """Move a state by what pulls at the residuals of all sites but the first `lead`."""
+        each = pull.reshape(len(self.matrix), 1, *self.matrix.shape[2:4], 1)[lead:]
+        np.subtract.at(w, self.channel[lead:], np.sum(self.matrix[lead:] * each, axis=(2, 3)))
 
 
 class WeakForm:
@@ -92,27 +123,56 @@ class WeakForm:
         order: of the equation.
         half_width: half the support of the test functions, in knot intervals of the state.
         power: p of (1 - s^2)^p.
+        most: values that are computed with at once.
 
     Attributes:
         state: splines through the samples.
         grid: times at which the integrands are evaluated (G,).
         tests: the test functions and two derivatives, times the step of the grid (3, tests, G).
         support: half the support of a test function, in units of time.
-        sites: the sites that have a weak equation.
+        sites: the sites that have a weak equation, in the order in which they share sites: a ring is folded.
         parts: 1 for a real field, 2 for a complex one.
+        shared: an equation shares sites with so many that come after it in this order, at most.
 
     Raises:
         InputError: too few samples or sites.
     """
 
     def __init__(
-        self, samples: Samples, library: Library, order: int, half_width: float = HALF_WIDTH, power: int = POWER
-    ) -> None:
+        self, samples: Samples, library: Library, order: int, half_width: float = HALF_WIDTH, power: int = POWER,
+        most: int = PIECE,
+    ) -> None:  # fmt: skip
         """Estimate the state, then place the test functions."""
-        self.samples, self.library, self.order = samples, library, order
+        self.samples, self.library, self.order, self.most = samples, library, order, most
         self.parts = 1 + samples.is_complex
         self.state = estimate_state(samples, order)
-        state, t = self.state, samples.t
+        self._place_tests(half_width, power)
+        self.value = self.state.basis(self.grid, 0)
+        self.rate = self.state.basis(self.grid, 1)
+        self.stencil = Stencil.chain(samples.sites, library.reach, samples.ends)
+        self.whole = self._whole()
+        read = [self.stencil.neighbours(offset) for offset in self.stencil.offsets]
+        kept = np.flatnonzero(np.all([self.whole[place] | (factor == 0) for place, factor in read], axis=0))
+        if len(kept) == 0:
+            raise InputError(
+                f"{samples.source}: no site has its whole stencil seen more than {self.state.degree} times; "
+                "there are too many missing values or too few sites"
+            )
+        count, reach = len(kept), sum(library.reach)
+        order_of = np.arange(count)
+        if self.stencil.is_ring:
+            order_of = np.minimum(2 * order_of, 2 * (count - 1 - order_of) + 1)
+            reach *= 2
+        kept = kept[np.argsort(order_of)]
+        self.sites = self.stencil.own[kept]
+        self.shared = min(reach, count - 1)
+        self._place, self._factor = (np.stack([one[number][kept] for one in read]) for number in range(2))
+        self._n = numbers(samples.sites)
+        self.terms = compiled(library.texts, samples.is_complex)
+        self.partials = partials(library.texts, samples.is_complex)
+
+    def _place_tests(self, half_width: float, power: int) -> None:
+        state, t = self.state, self.samples.t
         span = t[-1] - t[0]
         intervals = len(state.knots) - 2 * state.degree - 1
         if state.noise[0] < EXACT * state.size:
@@ -122,195 +182,169 @@ class WeakForm:
         self.grid = np.linspace(t[0], t[-1], int(np.ceil(POINTS * span / support)) + 1)
         centres = np.linspace(t[0] + support, t[-1] - support, count)
         self.tests = bumps(self.grid, centres, support, power) * (self.grid[1] - self.grid[0])
-        self.value = state.basis(self.grid, 0)
-        self.rate = state.basis(self.grid, 1)
-        self.stencil = Stencil.chain(samples.sites, library.reach, samples.ends)
-        whole = state.whole if samples.f is None else state.whole & (np.sum(~np.isnan(samples.f), axis=0) > 1)
-        read = [self.stencil.neighbours(offset) for offset in self.stencil.offsets]
-        self.kept = np.flatnonzero(np.all([whole[place] | (factor == 0) for place, factor in read], axis=0))
-        self.sites = self.stencil.own[self.kept]
-        if len(self.sites) == 0:
-            raise InputError(
-                f"{samples.source}: no site has its whole stencil seen more than {state.degree} times; "
-                "there are too many missing values or too few sites"
-            )
-        # At sites that are not used there may be no input at all.
-        self.input = (
-            None if samples.f is None else inputs(replace(samples, f=np.where(whole, samples.f, 0.0)), self.grid)
-        )
-        self.partials = partials(library.texts, samples.is_complex)
+
+    def _whole(self) -> Bool[ndarray, " sites"]:
+        """Return which sites were observed often enough, and whose input was."""
+        f = self.samples.f
+        if f is None:
+            return self.state.whole
+        seen = np.zeros(f.shape[1], int)
+        for some in rows_of(f):
+            seen += np.sum(~np.isnan(f[some]), axis=0)
+        return np.asarray(self.state.whole & (seen > 1))
 
     @property
     def count(self) -> int:
         """The number of test functions."""
         return int(self.tests.shape[1])
 
-    def fields(self, w: Float[ndarray, "channels coefficients"]) -> tuple[ndarray, ndarray]:
-        """Evaluate the state on the grid: u and v, each (G, N)."""
-        c = np.stack([factor @ one for factor, one in zip(self.state.factors, w, strict=True)], axis=1)
+    @functools.cached_property
+    def cuts(self) -> Int[ndarray, " cuts"]:
+        """Where the blocks begin among the sites, and the end of the last one."""
+        coefficients = self.state.seen.shape[1]
+        reads = len(self.stencil.offsets) * self.parts
+        each = max(
+            self.parts * reads * self.count * coefficients,
+            (self.shared + 1) * (self.parts * self.count) ** 2,
+            len(self.grid) * self.parts * len(self.library.terms),
+        )
+        if len(self.state.factors) > 1:
+            each += reads * coefficients**2
+        number = min(len(self.sites) * each // self.most, len(self.sites) // max(2 * self.shared, 1))
+        return np.linspace(0, len(self.sites), max(1, number) + 1).round().astype(int)
+
+    def block(self, number: int) -> Block:
+        """Return a block of sites; it begins with those that it shares with the one before."""
+        begin, end = (int(one) for one in self.cuts[number : number + 2])
+        some = slice(max(begin - self.shared, 0), end)
+        columns = np.unique(self._place[:, some])
+        place = np.searchsorted(columns, self._place[:, some])
+        return Block(begin - some.start, self.sites[some], columns, place, self._factor[:, some])
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield blocks of sites that go through all equations."""
+        return map(self.block, range(len(self.cuts) - 1))
+
+    def channels(self, block: Block) -> Int[ndarray, " channels"]:
+        """Return the numbers of the channels that a block reads."""
+        return np.asarray((block.columns[:, None] * self.parts + np.arange(self.parts)).ravel())
+
+    def fields(self, w: Float[ndarray, "channels coefficients"], block: Block) -> tuple[ndarray, ndarray]:
+        """Evaluate the state on the grid, at the columns of a block: u and v, each (G, columns)."""
+        channels = self.channels(block)
+        c = np.matmul(self.state.factor(channels), w[channels][..., None])[..., 0].T
         u, v = self.value @ c, self.rate @ c
         if self.parts == 1:
             return u, v
         return u[:, ::2] + 1j * u[:, 1::2], v[:, ::2] + 1j * v[:, 1::2]
 
     def rows(
-        self, w: Float[ndarray, "channels coefficients"]
+        self, w: Float[ndarray, "channels coefficients"], block: Block
     ) -> tuple[Float[ndarray, "equations tests"], Float[ndarray, "equations tests terms"]]:
         """Return both sides: (-1)^order int phi^(order) u, and int phi T_j in units of the term times time."""
-        u, v = self.fields(w)
-        values = evaluate(
-            self.library.terms, u, v, self.input, self.grid, ends=self.samples.ends, reach=self.library.reach
-        )
-        design = np.einsum("kg,ptgs->spkt", self.tests[0], values[..., self.kept], optimize=True)
-        field = np.stack([u.real, u.imag][: self.parts])[:, :, self.sites]
-        target = np.einsum("kg,pgs->spk", self._main, field, optimize=True)
-        equations = len(self.sites) * self.parts
+        u, v = self.fields(w, block)
+        shape = (len(self.grid), len(block.sites))
+        with np.errstate(all="ignore"):
+            values = self.terms.function(*self._arrays(self.terms.slots, u, v, block))
+        listed = np.stack([np.broadcast_to(value, shape) for value in values]).reshape(self.parts, -1, *shape)
+        design = np.einsum("kg,ptgs->spkt", self.tests[0], listed.astype(float), optimize=True)
+        own = u[:, np.searchsorted(block.columns, block.sites)]
+        target = np.einsum("kg,pgs->spk", self._main, np.stack([own.real, own.imag][: self.parts]), optimize=True)
+        equations = len(block.sites) * self.parts
         return target.reshape(equations, self.count), design.reshape(equations, self.count, -1)
+
+    def pieces(self, w: Float[ndarray, "channels coefficients"]) -> Iterator[Float[ndarray, "rows terms_and_target"]]:
+        """Yield `rows` of all equations, block by block, the left side in the last column."""
+        for block in self.blocks():
+            target, design = (one[block.lead * self.parts :] for one in self.rows(w, block))
+            yield np.concatenate([design, target[..., None]], axis=-1).reshape(target.size, -1)
+
+    @functools.cached_property
+    def height(self) -> float:
+        """RMS of the left side on the observed state."""
+        squares, count = 0.0, 0
+        for block in self.blocks():
+            u = self.fields(self.state.seen, block)[0][:, np.searchsorted(block.columns, block.sites[block.lead :])]
+            squares += float(np.sum(np.abs(self._main @ u) ** 2))
+            count += u.shape[1] * self.parts * self.count
+        return float(np.sqrt(squares / count))
 
     @property
     def _main(self) -> ndarray:
         return np.asarray(-self.tests[1] if self.order == 1 else self.tests[2])
 
-    def slopes(self, w: Float[ndarray, "channels coefficients"], coefficients: Float[ndarray, " terms"]) -> list[Slope]:
-        """Return the derivative of the residual of the weak equations by the state, one piece per channel."""
-        profiles: defaultdict[int, dict[int, dict[str, ndarray]]] = defaultdict(dict)
-        for (part, slot), slope in self._derivatives(w, coefficients).items():
-            places, factors = self.stencil.neighbours(slot.vector)
-            for k, (place, factor) in enumerate(zip(places[self.kept], factors[self.kept], strict=True)):
-                if factor:
-                    channel = int(place) * self.parts + (slot.part == "im")
-                    one = profiles[channel].setdefault(k * self.parts + part, {})
-                    one[slot.name] = one.get(slot.name, 0) + factor * slope[:, k]
-        own = (self.sites[:, None] * self.parts + np.arange(self.parts)).ravel()
-        for equation, channel in enumerate(own):
-            profiles[int(channel)].setdefault(equation, {})
-        result = []
-        for channel, found in sorted(profiles.items()):
-            equations = np.array(sorted(found))
-            by_value = np.zeros((len(equations), *self._main.shape))
-            by_rate = np.zeros_like(by_value)
-            for k, equation in enumerate(equations):
-                if own[equation] == channel:
-                    by_value[k] += self._main
-                by_value[k] -= self.tests[0] * found[equation].get("u", 0.0)
-                by_rate[k] -= self.tests[0] * found[equation].get("v", 0.0)
-            matrix = by_value.reshape(-1, len(self.grid)) @ self.value
-            if any("v" in one for one in found.values()):
-                matrix += by_rate.reshape(-1, len(self.grid)) @ self.rate
-            result.append(Slope(channel, equations, matrix @ self.state.factors[channel]))
-        return result
-
-    def _derivatives(self, w: ndarray, coefficients: ndarray) -> dict[tuple[int, Any], ndarray]:
-        """Return sum_j xi_j dT_j / d(slot) for each part and variable of the stencil, each (G, sites)."""
-        bundle, places = self.partials
-        u, v = self.fields(w)
-        shape = (len(self.grid), len(self.sites))
-        n = numbers(self.samples.sites)[self.sites]
+    def _arrays(self, slots: Sequence[Slot], u: ndarray, v: ndarray, block: Block) -> list[ndarray]:
+        """Return the values of the variables of the stencil at the sites of a block (G, M)."""
+        shape = (len(self.grid), len(block.sites))
         arrays: list[ndarray] = []
-        for slot in bundle.slots:
+        f = self._input(block) if any(slot.name == "f" for slot in slots) else None
+        for slot in slots:
             if slot.name in ("t", "n"):
-                arrays.append(np.broadcast_to(self.grid[:, None] if slot.name == "t" else n, shape))
+                values = self.grid[:, None] if slot.name == "t" else self._n[block.sites]
+                arrays.append(np.broadcast_to(values, shape))
                 continue
-            field = {"u": u, "v": v, "f": self.input}[slot.name]
+            field = {"u": u, "v": v, "f": f}[slot.name]
             assert field is not None
-            place, factor = (one[self.kept] for one in self.stencil.neighbours(slot.vector))
-            window = field[:, place] * factor
-            arrays.append(window.imag if slot.part == "im" else window.real)
-        found: dict[tuple[int, Any], ndarray] = {}
-        if places and np.any(coefficients):
-            # |u| has no derivative at 0; what is not finite there is left out.
-            with np.errstate(all="ignore"):
-                values = bundle.function(*arrays)
-            for (term, part, slot), value in zip(places, values, strict=True):
-                if coefficients[term]:
-                    slope = np.broadcast_to(np.where(np.isfinite(value), value, 0.0), shape) * coefficients[term]
-                    found[part, slot] = found.get((part, slot), 0.0) + slope
+            offset = self.stencil.offsets.index(slot.vector)
+            read = field[:, block.place[offset]] * block.factor[offset]
+            arrays.append(read.imag if slot.part == "im" else read.real)
+        return arrays
+
+    def _input(self, block: Block) -> Float[ndarray, "grid columns"]:
+        """Return the measured input at the columns of a block; at sites that are not used there may be none at all."""
+        assert self.samples.f is not None
+        f = np.where(self.whole[block.columns], self.samples.f[:, block.columns], 0.0)
+        return inputs(replace(self.samples, u=f, v=None, f=f), self.grid)
+
+    def slopes(
+        self, w: Float[ndarray, "channels coefficients"], coefficients: Float[ndarray, " terms"], block: Block
+    ) -> Slopes:
+        """Return the derivative of the residuals of a block's weak equations by the state."""
+        slopes = self._derivatives(w, coefficients, block)
+        offsets = self.stencil.offsets
+        own = [((0,) * len(offsets[0]), part) for part in range(self.parts)]
+        read = sorted({*own, *((slot.vector, int(slot.part == "im")) for _, slot in slopes)})
+        matrix = np.zeros((len(block.sites), len(read), self.parts, self.count, self.value.shape[1]))
+        for part, one in enumerate(own):
+            matrix[:, read.index(one), part] = self._main @ self.value
+        for (part, slot), slope in slopes.items():
+            profile = (slope * block.factor[offsets.index(slot.vector)]).T
+            target = matrix[:, read.index((slot.vector, int(slot.part == "im"))), part]
+            for k, (some, columns, product) in enumerate(self._products[slot.name]):
+                target[:, k, columns] -= profile[:, some] @ product
+        place = np.stack([block.place[offsets.index(vector)] * self.parts + part for vector, part in read], axis=1)
+        channel = self.channels(block)[place]
+        if len(self.state.factors) == 1:
+            return Slopes(channel, matrix @ self.state.factors[0])
+        return Slopes(channel, np.matmul(matrix, self.state.factor(channel)[:, :, None]))
+
+    @functools.cached_property
+    def _products(self) -> dict[str, list[tuple[slice, slice, ndarray]]]:
+        """The part of the grid and of the splines where each test function acts, and its product with these splines."""
+        found: dict[str, list[tuple[slice, slice, ndarray]]] = {}
+        for name, basis in (("u", self.value), ("v", self.rate)):
+            found[name] = []
+            for test in self.tests[0]:
+                some = np.flatnonzero(test)
+                points = slice(int(some[0]), int(some[-1]) + 1)
+                some = np.flatnonzero(np.any(self.value[points], axis=0))
+                columns = slice(int(some[0]), int(some[-1]) + 1)
+                found[name].append((points, columns, test[points, None] * basis[points, columns]))
         return found
 
-    def ranks(self) -> ndarray:
-        """Return an order in which equations that share channels are near each other; a ring is folded."""
-        sites = len(self.sites)
-        rank = np.arange(sites)
-        if self.stencil.is_ring:
-            rank = np.minimum(2 * rank, 2 * (sites - 1 - rank) + 1)
-        return np.asarray((rank[:, None] * self.parts + np.arange(self.parts)).ravel())
-
-
-class Covariance:
-    """The Cholesky factor of the weak equations' covariance, a band matrix."""
-
-    def __init__(self, form: WeakForm, slopes: Sequence[Slope], accuracy: float) -> None:
-        from scipy.linalg import cholesky_banded
-
-        tests, equations = form.count, len(form.sites) * form.parts
-        self.shape = (equations, tests)
-        self.rank = form.ranks()
-        self.order = np.argsort(self.rank)
-        blocks: dict[tuple[int, int], ndarray] = {}
-        for slope in slopes:
-            gram = slope.matrix @ slope.matrix.T
-            for i, one in enumerate(self.rank[slope.equations]):
-                for j, other in enumerate(self.rank[slope.equations]):
-                    if one >= other:
-                        block = gram[i * tests : (i + 1) * tests, j * tests : (j + 1) * tests]
-                        blocks[one, other] = blocks.get((one, other), 0.0) + block
-        width = (1 + max(one - other for one, other in blocks)) * tests
-        band = np.zeros((width, equations * tests))
-        row, column = np.indices((tests, tests))
-        for (one, other), block in blocks.items():
-            below = (one - other) * tests + row - column
-            lower = below >= 0
-            band[below[lower], (other * tests + column)[lower]] = block[lower]
-        band[0] += accuracy**2
-        for jitter in (0.0, 1e-13, 1e-11, 1e-9, 1e-7):
-            try:
-                shifted = band.copy()
-                shifted[0] *= 1 + jitter
-                self.factor = cholesky_banded(shifted, lower=True, check_finite=False)
-                return
-            except np.linalg.LinAlgError:
-                continue
-        raise np.linalg.LinAlgError("the covariance of the weak equations is not positive")
-
-    def whiten(self, rows: Float[ndarray, "equations tests *terms"]) -> ndarray:
-        """Multiply by the inverse of the factor: rows with independent noise of variance 1."""
-        from scipy.linalg.lapack import dtbtrs
-
-        flat = rows[self.order].reshape(self.shape[0] * self.shape[1], -1)
-        return np.asarray(dtbtrs(self.factor, flat, uplo="L")[0])
-
-    def solve(self, rows: Float[ndarray, "equations tests"]) -> ndarray:
-        """Multiply by the inverse of the covariance."""
-        from scipy.linalg import cho_solve_banded
-
-        solved = cho_solve_banded((self.factor, True), rows[self.order].ravel(), check_finite=False)
-        return np.asarray(solved.reshape(self.shape)[self.rank])
-
-
-def linearised(
-    form: WeakForm, w: Float[ndarray, "channels coefficients"], coefficients: Float[ndarray, " terms"], accuracy: float
-) -> tuple[Float[ndarray, "equations tests"], Float[ndarray, "equations tests terms"], list[Slope], Covariance]:
-    """Linearise the weak equations on the observed state about the state w.
-
-    Args:
-        form: the weak equations of a trajectory.
-        w: the state that the terms are evaluated on.
-        coefficients: xi.
-        accuracy: standard deviation of the errors of quadrature and splines.
-
-    Returns:
-        the left side (equations, tests), the terms on the right (equations, tests, terms), the derivatives by the
-        state, and the covariance.
-
-    Raises:
-        FloatingPointError: a term is not finite.
-        LinAlgError: the covariance is not positive.
-    """
-    target, design = form.rows(w)
-    slopes = form.slopes(w, coefficients)
-    if not (np.all(np.isfinite(design)) and all(np.all(np.isfinite(slope.matrix)) for slope in slopes)):
-        raise FloatingPointError("a term is not finite on the data")
-    for slope in slopes:
-        moved = slope.matrix @ (form.state.seen[slope.channel] - w[slope.channel])
-        target[slope.equations] += moved.reshape(-1, form.count)
-    return target, design, slopes, Covariance(form, slopes, accuracy)
+    def _derivatives(self, w: ndarray, coefficients: ndarray, block: Block) -> dict[tuple[int, Slot], ndarray]:
+        """Return sum_j xi_j dT_j / d(slot) for each part and variable u or v of the stencil, each (G, M)."""
+        bundle, places = self.partials
+        found: dict[tuple[int, Slot], ndarray] = {}
+        if not places or not np.any(coefficients):
+            return found
+        shape = (len(self.grid), len(block.sites))
+        arrays = self._arrays(bundle.slots, *self.fields(w, block), block)
+        # |u| has no derivative at 0; what is not finite there is left out.
+        with np.errstate(all="ignore"):
+            values = bundle.function(*arrays)
+        for (term, part, slot), value in zip(places, values, strict=True):
+            if coefficients[term] and slot.name in "uv":
+                slope = np.broadcast_to(np.where(np.isfinite(value), value, 0.0), shape) * coefficients[term]
+                found[part, slot] = found.get((part, slot), 0.0) + slope
+        return found

@@ -181,3 +181,12 @@ def test_where_the_weak_form_gives_no_start_pieces_lead_to_the_same_fit(monkeypa
     # Too few samples for a weak form.
     few = seen("phi4", 0.001, 0, times=sample_times(5, 1.0))
     assert error(solve(Trajectory(), [few], one, 2, 0), [2.0, 2.0, -2.0, -2.0]) < 0.1
+
+
+def test_a_time_in_which_no_site_that_moves_was_seen_adds_nothing_and_takes_nothing():
+    """u_1' = -i u_1 + 0.3 i u_2, where u_2 turns as it likes: a solution written by hand."""
+    t = 0.25 * np.arange(16)
+    u = np.column_stack([0.6 * np.exp(-1j * t) + 0.05 * np.exp(2j * t), 0.5 * np.exp(2j * t)])
+    u[-8:, 0] = np.nan
+    fit = solve(Trajectory(), [Samples(t, u)], library("own", "i*u[n]; i*u[n+1]"), 1, 0)
+    np.testing.assert_allclose(fit.coefficients, [-1.0, 0.3], atol=1e-3)

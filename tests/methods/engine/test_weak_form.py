@@ -32,7 +32,7 @@ def test_the_weak_integrals_of_a_harmonic_oscillator_are_those_of_bessel_functio
     w, power = 1.7, 12
     t = sample_times(200)
     form = WeakForm(Samples(t, np.cos(w * t)[:, None]), library("one", "u[n]"), 2, 3.5, power)
-    target, design = form.rows(form.state.seen)
+    target, design = form.rows(form.state.seen, form.block(0))
     a = form.support
     centres = np.linspace(t[0] + a, t[-1] - a, form.count)
     expected = a * np.cos(w * centres) * np.sqrt(np.pi) * gamma(power + 1) * (2 / (w * a)) ** (power + 0.5)
@@ -62,12 +62,13 @@ def test_the_residuals_slope_is_its_finite_difference() -> None:
     w = form.state.seen
     direction = np.random.default_rng(0).normal(size=w.shape)
 
+    block = form.block(0)
+
     def residual(state: np.ndarray) -> np.ndarray:
-        target, design = form.rows(state)
+        target, design = form.rows(state, block)
         return np.asarray(target - design @ coefficients)
 
     expected = (residual(w + 1e-4 * direction) - residual(w - 1e-4 * direction)) / 2e-4
-    found = np.zeros_like(expected)
-    for slope in form.slopes(w, coefficients):
-        found[slope.equations] += (slope.matrix @ direction[slope.channel]).reshape(-1, form.count)
+    slopes = form.slopes(w, coefficients, block)
+    found = slopes.moved(direction[slopes.channel])
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.max(np.abs(expected)))
