@@ -7,11 +7,14 @@ whose coefficients are fitted along with the piece's initial state.
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.engine.dynamics import Dynamics
@@ -26,8 +29,13 @@ if TYPE_CHECKING:
 DEGREE = 5
 # B-splines of a piece, as a share of its rows: with as many as there are readings these would have no noise.
 MOST = 0.6
-# Numbers of B-splines that are compared.
-SIZES = 8
+# Numbers of B-splines that are compared first, and how often the way to the nearest ones is halved.
+SIZES, HALVED = 8, 2
+# So many times as many are taken as cross-validation asks for: there errors of the curve and of its numbers are of one
+# size, but errors of the curve look like forces; they fall with the sixth power.
+FINER = 1.25
+# Innovations of stronger correlations would say nothing of the slow part of a motion.
+MOST_CORRELATED = 0.98
 # Knots reach beyond the rows of a piece by this share of the time between rows.
 BEYOND = 0.25
 
@@ -111,6 +119,7 @@ def borders(
     splines: Sequence[ndarray | None],
     rows: Sequence[Int[ndarray, "pieces m"]],
     valid: Sequence[Bool[ndarray, "pieces m"]],
+    memory: float = 0.0,
 ) -> tuple[Border | None, ...]:
     """Return the curves of each recording's outer sites, with as many B-splines as cross-validation asks for.
 
@@ -120,31 +129,38 @@ def borders(
         splines: of smoothed readings of those sites, of each recording.
         rows: of each piece.
         valid: whether a row is none of those repeated at the end of a shorter piece.
+        memory: correlation time of the noise; 0 for white noise.
     """
     if not len(plain.border):
         return (None,) * len(records)
     shortest = min(int(np.min(np.sum(one, axis=1))) for one in valid)
     most = max(2, int(MOST * shortest))
     degree = min(DEGREE, most - 1)
-    best, chosen = np.inf, 1
-    for intervals in sorted({round(one) for one in np.geomspace(1, most - degree, SIZES)}):
-        parts = [_cross_validated(*one, plain, intervals, degree) for one in zip(records, rows, valid, strict=True)]
-        left, free, count = np.sum(parts, axis=0)
-        score = float(np.log(left / count + 1e-24) - 2 * np.log(1 - free / count)) if free < count else np.inf
-        if score < best:
-            best, chosen = score, intervals
+    read = [_Read.of(*one, plain, memory) for one in zip(records, rows, valid, strict=True)]
+
+    @functools.cache
+    def score(intervals: int) -> float:
+        left, free, count = np.sum([one.cross_validated(intervals, degree) for one in read], axis=0)
+        return float(np.log(left / count + 1e-24) - 2 * np.log(1 - free / count)) if free < count else np.inf
+
+    sizes = {round(one) for one in np.geomspace(1, most - degree, SIZES)}
+    chosen = min(sorted(sizes), key=score)
+    for _ in range(HALVED):
+        # The geometric means with the nearest numbers on both sides that have been tried.
+        beside = [max((one for one in sizes if one < chosen), default=chosen)]
+        beside += [min((one for one in sizes if one > chosen), default=chosen)]
+        sizes |= {round(float(np.sqrt(chosen * one))) for one in beside}
+        chosen = min(sorted(sizes), key=score)
+    chosen = min(math.ceil(FINER * chosen), most - degree)
     found = []
     for number, (record, row) in enumerate(zip(records, rows, strict=True)):
         t = record.times[row]
         basis, first, width = _basis(t, record.times, chosen, degree)
         curve = record.stretches.driven(t.ravel(), splines[number])
         assert curve is not None
-        target = curve[:, 0].reshape(*row.shape, -1)
-        design = _designs(basis, first, width, t)[0] * valid[number][..., None]
-        local = np.linalg.pinv(design, rcond=1e-8) @ (target * valid[number][..., None])
-        start = np.zeros((basis.count, *curve.shape[2:]))
-        start[first[:, None] + np.arange(width)] = local.reshape(*local.shape[:2], *curve.shape[2:])
-        found.append(Border(basis, first, width, start))
+        weight = valid[number].ravel()[:, None].astype(float)
+        start = _least_squares(_design(basis, t), weight, curve[:, 0].reshape(t.size, -1))
+        found.append(Border(basis, first, width, start.reshape(basis.count, *curve.shape[2:])))
     return tuple(found)
 
 
@@ -172,22 +188,77 @@ def _designs(
     return found.reshape(2, *t.shape, width)
 
 
-def _cross_validated(
-    record: Record, rows: ndarray, valid: ndarray, plain: Dynamics, intervals: int, degree: int
-) -> tuple[float, float, float]:
-    """Return the sum of squares that B-splines leave of the readings, their number, and that of the readings."""
-    t = record.times[rows]
-    design = _designs(*_basis(t, record.times, intervals, degree), t)[0]
-    value = record.value[rows][:, :, 0][..., plain.border]
-    seen = record.seen[rows][:, :, 0][..., plain.border] & valid[..., None, None]
-    left = free = count = 0.0
-    for column in np.ndindex(value.shape[2:]):
-        here = seen[(slice(None), slice(None), *column)]
-        matrix = design * here[..., None]
-        target = np.where(here, value[(slice(None), slice(None), *column)], 0.0)[..., None]
-        size = max(float(np.std(target[here])), 1e-12) if np.any(here) else 1.0
-        rest = target - matrix @ (np.linalg.pinv(matrix, rcond=1e-8) @ target)
-        left += float(np.sum((rest / size) ** 2))
-        free += min(float(design.shape[0] * design.shape[2]), float(np.sum(here)))
-        count += float(np.sum(here))
-    return left, free, count
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """What was read of one recording's outer sites.
+
+    Attributes:
+        times: of the recording.
+        t: of the rows (pieces, m).
+        value: of each row (pieces * m, columns), 0 where nothing was read.
+        seen: whether it was read, likewise.
+        before: correlation of the noise with that of the row before, 0 at the first one of a piece (pieces * m,).
+    """
+
+    times: Float[ndarray, " time"]
+    t: Float[ndarray, "pieces m"]
+    value: Float[ndarray, "rows columns"]
+    seen: Bool[ndarray, "rows columns"]
+    before: Float[ndarray, " rows"]
+
+    @classmethod
+    def of(cls, record: Record, rows: ndarray, valid: ndarray, plain: Dynamics, memory: float) -> _Read:
+        t = record.times[rows]
+        value = record.value[rows][:, :, 0][..., plain.border].reshape(t.size, -1)
+        seen = record.seen[rows][:, :, 0][..., plain.border] & valid[..., None, None]
+        gap = np.diff(t, axis=1, prepend=-np.inf).ravel()
+        before = np.minimum(np.exp(-gap / memory), MOST_CORRELATED) if memory else np.zeros(t.size)
+        return cls(record.times, t, value, seen.reshape(t.size, -1), before)
+
+    def cross_validated(self, intervals: int, degree: int) -> tuple[float, float, float]:
+        """Return the sum of squares that B-splines leave of the readings, their number, and that of the readings.
+
+        Both readings and B-splines are taken in innovations, which are independent where the noise has a memory.
+        """
+        basis, _, width = _basis(self.t, self.times, intervals, degree)
+        design = _design(basis, self.t)
+        left = free = count = 0.0
+        for value, seen in zip(self.value.T, self.seen.T, strict=True):
+            whiten = self._innovations(seen)
+            target = (whiten @ value)[:, None]
+            size = max(float(np.std(value[seen])), 1e-12) if np.any(seen) else 1.0
+            own = (whiten @ design).tocsr()
+            rest = target - own @ _least_squares(own, seen[:, None].astype(float), target)
+            left += float(np.sum((rest[seen] / size) ** 2))
+            free += min(float(len(self.t) * width), float(np.sum(seen)))
+            count += float(np.sum(seen))
+        return left, free, count
+
+    def _innovations(self, seen: Bool[ndarray, " rows"]) -> csr_array:
+        """Return the matrix from readings to innovations; rows after one that was not read begin anew."""
+        from scipy.sparse import diags_array
+
+        rho = np.where(np.concatenate([[False], seen[:-1]]), self.before, 0.0)
+        unit = np.where(seen, 1 / np.sqrt(1 - rho**2), 0.0)
+        return csr_array(diags_array([unit, -(rho * unit)[1:]], offsets=[0, -1]))
+
+
+def _design(basis: BSplines, t: Float[ndarray, "pieces m"]) -> csr_array:
+    """Return the values of all pieces' B-splines at their rows, as a matrix (rows, splines)."""
+    begin, value, _ = basis.basis(t.ravel())
+    columns = begin[:, None] + np.arange(basis.degree + 1)
+    rows = np.broadcast_to(np.arange(t.size)[:, None], columns.shape)
+    return csr_array((value.ravel(), (rows.ravel(), columns.ravel())), shape=(t.size, basis.count))
+
+
+def _least_squares(design: csr_array, weight: ndarray, target: Float[ndarray, "rows columns"]) -> ndarray:
+    """Return the coefficients that leave least of the targets; 0 for B-splines that no reading touches."""
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import splu
+
+    gram = design.T @ (design * weight)
+    unit = np.sqrt(np.maximum(gram.diagonal(), 1e-12 * np.max(gram.diagonal(), initial=1e-300)))
+    scale = diags_array(1 / unit)
+    # What no reading says is decided by a last digit.
+    solved = splu((scale @ gram @ scale + 1e-11 * diags_array(np.ones(len(unit)))).tocsc())
+    return np.asarray(solved.solve((design.T @ (weight * target)) / unit[:, None]) / unit[:, None])

@@ -17,7 +17,8 @@ from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain
 from latticebench.diagnosis.horizon import Followed, Layout, Path, fields, follow, linearised
 from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.noise import Noise, Rows, Structure, Whitener, estimate
+from latticebench.diagnosis.noise import Noise, Rows, Structure, Whitener
+from latticebench.diagnosis.noise_estimate import estimate
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -37,6 +38,8 @@ UNDETERMINED = 1e-9
 FEW_PIECES = 8
 # How many standard deviations of chance are taken off the spread of a model's numbers between stretches.
 CHANCE = 3.0
+# Of a sum of squares at least this share is left whatever takes it away: scores are linear.
+MOST_TAKEN = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +220,11 @@ class Fitted:
         """The model with its numbers."""
         return self.followed.model
 
+    @property
+    def least(self) -> Float[ndarray, " sensors"]:
+        """The smallest variance that the noise of each sensor may have, in units of the one that was found."""
+        return np.asarray((self.rows.least / self.noise.size) ** 2)
+
     def linearised(self) -> Followed:
         """Return the derivatives of the motion, computed anew: they take as much memory as hundreds of motions."""
         found = linearised(self.followed, self.layout)
@@ -360,17 +368,23 @@ def spread(error: ndarray, robust: ndarray, tail: float) -> float:
     return float(np.mean((error * robust)[read] ** 2) * np.mean(weight) / max(float(np.mean(slope)), 0.1) ** 2)
 
 
-def gain(won: float, error: ndarray, count: float) -> float:
-    """Return the nats that a fall of the sum of squares is worth, the size of the noise being free.
+def gain(
+    before: float, after: Float[ndarray, " *candidates"] | float, count: float, least: float
+) -> Float[ndarray, " *candidates"]:
+    """Return the nats that a fall of the sum of squares is worth, the size of the noise being free above its least.
 
     Args:
-        won: the fall, in units of the noise.
-        error: what is left, in the same units.
+        before: the sum, in units of the noise.
+        after: what it falls to.
         count: of readings.
+        least: the smallest variance of the noise, in the same units.
     """
-    total = float(np.sum(error**2))
-    taken = min(won, 0.999999 * total)
-    return float(-0.5 * count * np.log1p(-taken / max(total, 1e-12 * count))) if taken > 0 else 0.0
+
+    def cost(total: ndarray | float) -> ndarray:
+        variance = np.maximum(np.asarray(total) / count, least)
+        return np.log(variance) + total / count / variance
+
+    return np.asarray(count / 2 * (cost(before) - cost(np.maximum(after, MOST_TAKEN * before))))
 
 
 def _taken(followed: Followed, layout: Layout, rows: Rows) -> Float[ndarray, " sensors"]:
@@ -396,13 +410,15 @@ def _stepped(
     """Return where a step leads, the damping of the next and the nats won; None where none promises enough."""
     _, error, slope, _ = whitened(followed, noise, rows)
     before, size = -noise.log_likelihood(followed.left, followed.swing, rows), followed.local
+    total, count = float(np.sum(error**2)), int(np.sum(np.isfinite(followed.left)))
+    lowest = float(np.min(rows.least / noise.size)) ** 2
     for _ in range(MOST_FAILURES):
         problem = normal(layout, error, slope, size, damping)
         change = problem.step(damping)
         if not np.all(np.isfinite(change)):
             return None
         promised = problem.promised(change)
-        if promised < ENOUGH / 2 or gain(2 * promised, error, float(np.sum(np.isfinite(followed.left)))) < least:
+        if promised < ENOUGH / 2 or gain(total, total - 2 * promised, count, lowest) < least:
             return None
         near, splines = [], []
         for number, (y, moves, inner) in enumerate(zip(followed.nodes, followed.moves, problem.inner, strict=True)):

@@ -75,11 +75,12 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
     else:
         other, share, steps = problem, 1 - HELD_OUT, STEPS
         model = _foreseeable(fitted.model, [one.t[round(len(one.t) * share)] for one in problem.data])
+    other = replace(other, plain=replace(other.plain, rest=fitted.layout.plain.rest))
     early = other.first(share)
-    layout = Layout.of(early, max(len(one.t) for one in early.data), None, fitted.layout.small)
+    layout = Layout.of(early, max(len(one.t) for one in early.data), None, fitted.layout.small, fitted.layout.memory)
     shorter = not held_out or len(other.plain.border)
     if shorter and fitted.longest < max(len(one.t) for one in problem.data):
-        layout = Layout.of(early, fitted.longest, None, fitted.layout.small)
+        layout = Layout.of(early, fitted.longest, None, fitted.layout.small, fitted.layout.memory)
     near = [nodes[rows] for nodes, rows in zip(early.nodes, layout.rows, strict=True)]
     if not held_out:
         near = _from(fitted, layout, early)

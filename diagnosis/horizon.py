@@ -35,7 +35,8 @@ CLOSURES, CLOSED, LOST = 6, 1.0, 1e6
 # Steps with derivatives from nearby must be so many times smaller: they do not square what is left.
 CHORD = 0.1
 # Steps of the integrator per typical interval, at most: friction that jumps would have as many as it is given.
-MOST_SUBSTEPS = 8
+# In a gap, which lasts as long as several, it is at least so many for each of them.
+MOST_SUBSTEPS, MOST_IN_GAPS = 8, 2
 # Numbers of the states of all intervals below which the time goes into calls, not into numbers.
 SMALL_BATCH = 5000
 # A piece of fewer rows says nothing.
@@ -64,6 +65,7 @@ class Layout:
         integrator: the one that needs the least work.
         least: the smallest size of the noise.
         small: a size of u that does not matter.
+        memory: correlation time of the noise, by which the numbers of the curves were chosen.
     """
 
     chain: Chain
@@ -77,9 +79,10 @@ class Layout:
     small: float
     integrator: Literal["dop853", "rk45"] = "dop853"
     least: float = 0.0
+    memory: float = 0.0
 
     @classmethod
-    def of(cls, problem: Problem, length: int, most: int | None, small: float) -> Layout:
+    def of(cls, problem: Problem, length: int, most: int | None, small: float, memory: float = 0.0) -> Layout:
         """Cut recordings into pieces of about `length` rows; of `most` rows in all, evenly spaced, if that is given."""
         found_rows, found_valid = [], []
         total = sum(len(record.times) for record in problem.records)
@@ -92,11 +95,13 @@ class Layout:
             found_rows.append(np.stack([np.minimum(begin + np.arange(m), end - 1) for begin, end in pieces]))
             found_valid.append(np.stack([begin + np.arange(m) < end for begin, end in pieces]))
         substeps = tuple(np.ones(rows.shape[0] * (rows.shape[1] - 1), dtype=int) for rows in found_rows)
-        curves = borders(problem.records, problem.plain, problem.splines, found_rows, found_valid)
+        curves = borders(problem.records, problem.plain, problem.splines, found_rows, found_valid, memory)
         return cls(
             problem.chain, problem.plain, problem.records, problem.splines, curves, tuple(found_rows),
             tuple(found_valid), substeps, small,
-            least=ROUNDING * min((one for one in problem.steps if one > 0), default=0.0),
+            least=max(ROUNDING * min((one for one in problem.steps if one > 0), default=0.0), problem.finest,
+                      problem.unrounded),
+            memory=memory,
         )  # fmt: skip
 
     @property
@@ -120,7 +125,12 @@ class Layout:
         first = np.concatenate([np.arange(rows.size) % rows.shape[1] == 0 for rows in self.rows])
         sensor = np.arange(self.chain.levels)[:, None, None] * self.chain.sites + np.arange(self.chain.sites)
         whole = np.broadcast_to(sensor, (self.chain.levels, self.chain.parts, self.chain.sites))
-        return Rows(times, first, whole.ravel(), self.least)
+        outer = frozenset(sensor[:, :, self.plain.border].ravel().tolist())
+        return Rows(times, first, whole.ravel(), self.least, outer)
+
+    def resting(self, rest: float) -> Layout:
+        """Return the same pieces, where dry friction is viscous below another speed."""
+        return replace(self, plain=replace(self.plain, rest=rest))
 
     def stretches(self, number: int, assembled: Assembled) -> Stretches:
         """Return the intervals of all pieces of one recording."""
@@ -181,9 +191,14 @@ class Layout:
             tolerance = np.repeat(levels, assembled.dynamics.parts * assembled.dynamics.count)
             flat = y[:, :-1].reshape(-1, y.shape[-1])
             stretches = self.stretches(number, assembled)
-            needed = stretches.substeps(assembled.coefficients, flat, tolerance, self.curves[number])
+            # In a single step through a gap the motion would be lost.
             lasting = np.ceil((stretches.end - stretches.begin) / float(np.median(np.diff(self.records[number].times))))
-            found.append(np.minimum(needed, MOST_SUBSTEPS * np.maximum(lasting, 1).astype(int)))
+            least = np.maximum(lasting, 1).astype(int)
+            needed = stretches.substeps(
+                assembled.coefficients, flat, tolerance, self.curves[number],
+                np.maximum(MOST_SUBSTEPS // least, MOST_IN_GAPS), least,
+            )  # fmt: skip
+            found.append(needed)
         return tuple(found)
 
 

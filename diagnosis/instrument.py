@@ -38,6 +38,8 @@ LINE = 30.0
 FAST = 0.2
 # Bands of the spectrum, of which one may hold nothing but noise, and the fewest frequencies in each.
 BANDS, FEWEST_LINES = 16, 8
+# A size within so many times the smallest that is looked for may be any smaller one.
+AT_LEAST = 1.1
 ROBUST = 1.4826  # standard deviation over median absolute value, of a Gaussian
 
 
@@ -227,7 +229,9 @@ def _has_fast_lines(values: Float[ndarray, " time"], order: int) -> bool:
 # In words -------------------------------------------------------------------------------------------------------------
 
 
-def describe(noise: Noise, steps: Sequence[float], unit: str = "", *, interval: float | None = None) -> list[str]:
+def describe(
+    noise: Noise, steps: Sequence[float], unit: str = "", *, interval: float | None = None, least: float = 0.0
+) -> list[str]:
     """Return the noise in words, a line for each sensor, or one line for all if they are alike.
 
     Args:
@@ -235,10 +239,12 @@ def describe(noise: Noise, steps: Sequence[float], unit: str = "", *, interval: 
         steps: step of each sensor's converter, 0 where there is none; what is fine beside the noise is not said.
         unit: of the readings.
         interval: time from one reading to the next; with it, the correlation over it is said.
+        least: the smallest size that was looked for.
     """
     lines = []
     for size, time, step in zip(noise.deviation(), noise.memory, steps, strict=True):
-        parts = [f"{_number(size)} {unit}".rstrip()]
+        most = "at most " if size < AT_LEAST * least else ""
+        parts = [f"{most}{_number(size)} {unit}".rstrip()]
         if step > COARSE * size:
             parts.append(f"steps of {_number(step)}")
         if time > 0:

@@ -78,6 +78,12 @@ class Model:
         """Whether all effects have numbers such as they may have."""
         return all(one.possible for one in self.effects)
 
+    @property
+    def rubs(self) -> bool:
+        """Whether there is dry friction in it."""
+        texts = [text for one in self.effects for text in one.effect.texts(self.order, is_complex=False)]
+        return any(read_term(text).jumps for text in (*self.declared.texts, *texts))
+
     def with_past(self, past: tuple[Factor, ...]) -> Model:
         """Return the same model, fed with another field at earlier times of each recording."""
         return replace(self, effects=tuple(one.with_past(past) for one in self.effects))

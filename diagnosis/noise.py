@@ -16,7 +16,7 @@ All likelihoods are natural logarithms with their normalising constants, so that
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,31 +28,11 @@ if TYPE_CHECKING:
     Readings = Float[ndarray, "rows channels"]
     Seen = Bool[ndarray, "rows channels"]
 
-# A size is at least this share of the level's root mean square: arithmetic with doubles is no more accurate.
-FLOOR = 1e-12
-# Where noise grows with the signal, at zero signal it is at least this share of its median; and the standard deviation
-# of a Gaussian over its median absolute value.
-AT_REST, ROBUST = 0.1, 1.4826
-# Below 2 degrees of freedom there is no variance; closer to 2 it rests on a handful of outliers.
-HEAVIEST = 2.5
-# Beyond, Student's t is a Gaussian for any record.
-LIGHTEST = 1000.0
-# Correlations from one typical reading to the next. A stronger one than the largest may stand for any slow misfit of
-# the equation, which the equation should have to answer for; below the least, the noise is white.
-MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
 # Readings closer than this share of the typical interval correlate as over that: part of any noise is white, and of
 # white noise two readings at nearly the same time differ as any others.
 CLOSE = 0.2
 # What is left between strongly correlated readings must not be divided by zero.
 CLOSEST = 1e-4
-# Nats that each part of the structure must win beyond Schwarz' penalty. Four parts are tried, on records of less than a
-# hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100 records.
-MARGIN = 2.0
-# Readings that the structure is chosen from, in stretches all over a longer record: what so many do not show changes
-# sizes by less than a per cent.
-GLANCE, STRETCHES = 20_000, 10
-# Of a sensor's readings a fit leaves at least this share free.
-SPARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +44,16 @@ class Rows:
         first: whether a piece begins (rows,); nothing correlates with the row before.
         sensor: the sensor of each channel (channels,), from 0; the channels of one sensor, such as the real and the
             imaginary part of a field, share its noise.
+        least: the smallest size of the noise.
+        curved: sensors of which a free curve takes the slow part of the noise: their own memory, tails and growth
+            cannot be seen, and are taken to be those of the others.
     """
 
     times: Float[ndarray, " rows"]
     first: Bool[ndarray, " rows"]
     sensor: Int[ndarray, " channels"]
     least: float = 0.0
+    curved: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -132,11 +116,11 @@ class Noise:
         """
         whitener = self.whitener(level, rows, np.isfinite(left))
         z = whitener.apply(left)[whitener.seen]
-        return -whitener.log_scale - _minus_log_density(z, self.tail)
+        return -whitener.log_scale - minus_log_density(z, self.tail)
 
     def whitener(self, level: Readings, rows: Rows, seen: Seen) -> Whitener:
         """Return what turns residuals of the readings that were seen into independent ones of equal size."""
-        chain = _chained(rows, seen)
+        chain = chained(rows, seen)
         size = np.hypot(self.size[chain.sensor], self.growth * np.abs(chain.of(level)))
         time = self.memory[chain.sensor]
         rho = np.where(time > 0, np.minimum(np.exp(-chain.gap / np.where(time > 0, time, 1.0)), 1 - CLOSEST), 0.0)
@@ -160,7 +144,7 @@ class Whitener:
         log_scale: sum of the logarithms of the innovations' sizes s_k sqrt(1 - rho_k^2).
     """
 
-    chain: _Chain
+    chain: Chained
     seen: Seen
     own: Float[ndarray, " readings"]
     before: Float[ndarray, " readings"]
@@ -202,7 +186,7 @@ class Whitener:
 
 
 @dataclass(frozen=True, eq=False)
-class _Chain:
+class Chained:
     """The readings that were seen, channel after channel: their places in a flat array (channels, rows) and sensors.
 
     `gap` is the time since the reading before, at least `CLOSE` of the typical one; infinite where there is none in the
@@ -218,7 +202,8 @@ class _Chain:
         return np.asarray(values.T.reshape(-1)[self.where])
 
 
-def _chained(rows: Rows, seen: Seen) -> _Chain:
+def chained(rows: Rows, seen: Seen) -> Chained:
+    """Return the readings that were seen in their order."""
     where = np.flatnonzero(seen.T)
     channel, row = np.divmod(where, max(len(rows.times), 1))
     piece = np.cumsum(rows.first)[row]
@@ -226,10 +211,10 @@ def _chained(rows: Rows, seen: Seen) -> _Chain:
     gap = np.full(len(where), np.inf)
     gap[1:] = np.where(linked, np.diff(rows.times[row]), np.inf)
     apart = gap[np.isfinite(gap) & (gap > 0)]
-    return _Chain(where, rows.sensor[channel], np.maximum(gap, CLOSE * np.median(apart)) if len(apart) else gap)
+    return Chained(where, rows.sensor[channel], np.maximum(gap, CLOSE * np.median(apart)) if len(apart) else gap)
 
 
-def _minus_log_density(z: Float[ndarray, " readings"], tail: float) -> float:
+def minus_log_density(z: Float[ndarray, " readings"], tail: float) -> float:
     """Return minus the sum of the logarithms of the densities of innovations in units of their size."""
     from scipy.special import betaln
 
@@ -237,256 +222,3 @@ def _minus_log_density(z: Float[ndarray, " readings"], tail: float) -> float:
         return float(np.sum(z**2) + len(z) * np.log(2 * np.pi)) / 2
     constant = betaln(tail / 2, 0.5) + np.log(tail) / 2
     return float((tail + 1) / 2 * np.sum(np.log1p(z**2 / tail)) + len(z) * constant)
-
-
-def _by_tail(z: Float[ndarray, " readings"], tail: float) -> float:
-    """Return the derivative of `_minus_log_density` by the degrees of freedom."""
-    from scipy.special import digamma
-
-    share = z**2 / tail
-    constant = (digamma(tail / 2) - digamma((tail + 1) / 2) + 1 / tail) / 2
-    return float(np.sum(np.log1p(share) - (tail + 1) / tail * share / (1 + share)) / 2 + len(z) * constant)
-
-
-# The estimate ---------------------------------------------------------------------------------------------------------
-
-
-def estimate(
-    left: Readings, level: Readings, rows: Rows, *, free: Float[ndarray, " sensors"] | float = 0.0,
-    structure: Structure | None = None, start: Noise | None = None,
-) -> Noise:  # fmt: skip
-    """Return the noise under which residuals are most likely.
-
-    Args:
-        left: readings less what a model says, NaN where nothing was read.
-        level: what the model says, in the same units.
-        rows: times and sensors of both.
-        free: how many numbers the fit of the model took from the n readings, of each sensor or of all together. Such a
-            fit leaves residuals that are too small: sizes are multiplied by sqrt(n / (n - free)).
-        structure: which parts to use; chosen by Schwarz' criterion if left out.
-        start: where to start, such as the noise at the last step of an iteration.
-    """
-    task = _Task.of(left, level, rows)
-    if structure is None:
-        start = _chosen(_Task.of(*_glance(left, level, rows)))
-        structure = start.structure
-    found = task.best(structure, start)[0]
-    everything, taken = len(task.value), float(np.sum(free))
-    scale = float(np.sqrt(everything / max(everything - taken, 1.0))) if everything else 1.0
-    own = np.full(task.sensors, scale)
-    if np.ndim(free) and found.structure.own_sizes:
-        count = np.bincount(task.sensor, minlength=task.sensors)
-        own = np.sqrt(np.maximum(count, 1) / np.maximum(count - free, SPARE * np.maximum(count, 1)))
-    return replace(found, size=found.size * own, growth=found.growth * scale)
-
-
-def _glance(left: ndarray, level: ndarray, rows: Rows) -> tuple[ndarray, ndarray, Rows]:
-    """Return stretches of a long record, each a piece of its own; of a short one all there is."""
-    count, kept = len(rows.times), GLANCE // max(len(rows.sensor), 1)
-    if count <= kept:
-        return left, level, rows
-    begin = np.linspace(0, count - kept // STRETCHES, STRETCHES).astype(int)
-    few = (begin[:, None] + np.arange(kept // STRETCHES)).ravel()
-    first = rows.first[few]
-    first[:: kept // STRETCHES] = True
-    return left[few], level[few], replace(rows, times=rows.times[few], first=first)
-
-
-def _chosen(task: _Task) -> Noise:
-    """Return the noise of the structure that Schwarz' criterion prefers, found step by step.
-
-    One part is added or taken away at a time, whichever helps most, until nothing helps: what one part did alone may
-    later be done better by another.
-    """
-    tried: dict[Structure, tuple[float, Noise]] = {}
-
-    def price(structure: Structure, near: Noise | None) -> float:
-        if structure not in tried:
-            noise, likelihood = task.best(structure, near)
-            each = np.log(max(len(task.value), 1)) / 2
-            tried[structure] = each * noise.parameters + MARGIN * sum(vars(structure).values()) - likelihood, noise
-        return tried[structure][0]
-
-    here = Structure()
-    price(here, None)
-    while not task.is_exact():
-        found = tried[here][1]
-        ways = [replace(here, **{part: not getattr(here, part)}) for part in task.possible]
-        best = min(ways, key=lambda one: price(one, found))
-        if tried[best][0] >= tried[here][0]:
-            break
-        here = best
-    return tried[here][1]
-
-
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """Residuals in their order and in units of their own: their largest scale and the typical interval are 1.
-
-    Attributes:
-        value, level, sensor: residual and absolute level, divided by `unit`, and sensor of each reading.
-        gap, linked: interval to the reading before, divided by `interval`, and whether there is one.
-        even: whether all intervals are alike.
-        unit, interval: root mean square of the residuals and median interval.
-        floor: least size, divided by `unit`.
-        possible: parts of a structure that can make a difference.
-    """
-
-    value: Float[ndarray, " readings"]
-    level: Float[ndarray, " readings"]
-    sensor: Int[ndarray, " readings"]
-    gap: Float[ndarray, " readings"]
-    linked: Bool[ndarray, " readings"]
-    even: bool
-    unit: float
-    interval: float
-    floor: float
-    sensors: int
-    possible: tuple[str, ...]
-
-    @classmethod
-    def of(cls, left: Readings, level: Readings, rows: Rows) -> _Task:
-        chain = _chained(rows, np.isfinite(left))
-        value, heights = chain.of(left), np.abs(chain.of(level))
-        height = float(np.sqrt(np.mean(heights**2))) if len(heights) else 0.0
-        floor = max(FLOOR * height, rows.least, np.finfo(float).tiny ** 0.5)
-        unit = max(float(np.sqrt(np.mean(value**2))) if len(value) else 0.0, floor)
-        linked = np.isfinite(chain.gap)
-        apart = linked & (chain.gap > 0)
-        interval = float(np.median(chain.gap[apart])) if np.any(apart) else 1.0
-        gap = np.where(linked, chain.gap, 0.0) / interval
-        sensors = int(np.max(rows.sensor, initial=-1)) + 1
-        ways = {"own_sizes": sensors > 1, "growth": height > 0, "tails": True, "memory": bool(np.any(apart))}
-        return cls(
-            value / unit, heights / unit, chain.sensor, gap, linked, bool(np.all(np.abs(gap[linked] - 1) < 1e-6)),
-            unit, interval, floor / unit, sensors, tuple(part for part, there in ways.items() if there),
-        )  # fmt: skip
-
-    def is_exact(self) -> bool:
-        """Whether the residuals are no more than what arithmetic leaves."""
-        return self.floor >= 1 or not len(self.value)
-
-    def groups(self, structure: Structure) -> tuple[Int[ndarray, " readings"], int]:
-        """Return the group of each reading and the number of groups; sensors of a group share size and memory."""
-        if structure.own_sizes:
-            return self.sensor, self.sensors
-        return np.zeros_like(self.sensor), 1
-
-    def best(self, structure: Structure, start: Noise | None) -> tuple[Noise, float]:
-        """Return the noise of greatest likelihood with a given structure, and its log likelihood."""
-        from scipy.optimize import minimize
-
-        structure = replace(structure, **{part: False for part in vars(structure) if part not in self.possible})
-        plain = self.plain(structure)
-        if not len(self.value):
-            return plain, 0.0
-        numbers = self.packed(start or plain, structure)
-        if self.is_exact() or not (structure.growth or structure.tails or structure.memory):
-            numbers = self.packed(plain, structure)
-            found, cost = plain, self.cost(numbers, structure)[0]
-        else:
-            groups = self.groups(structure)[1]
-            bounds = [(np.log(least), np.log(1e3)) for least in self.least(structure)]
-            bounds += [(np.log(1e-6), np.log(1e6))] * structure.growth
-            bounds += [(1 / LIGHTEST, 1 / HEAVIEST)] * structure.tails
-            bounds += [(LEAST_CORRELATED, MOST_CORRELATED)] * (groups * structure.memory)
-            result = minimize(
-                self.cost, numbers, args=(structure,), jac=True, method="L-BFGS-B", bounds=bounds,
-                options={"ftol": 1e-4 / len(self.value), "gtol": 1e-5, "maxiter": 200},
-            )  # fmt: skip
-            found, cost = self.unpacked(np.asarray(result.x), structure), float(result.fun)
-        return found, -len(self.value) * (cost + float(np.log(self.unit)))
-
-    def least(self, structure: Structure) -> list[float]:
-        """Return the least size of each group, divided by `unit`.
-
-        Of noise that grows with the signal it is a share of the residuals' scale: with none at zero signal the
-        likelihood has no bound, as readings near zero are then beyond all doubt.
-        """
-        group, groups = self.groups(structure)
-        if not structure.growth:
-            return [self.floor] * groups
-        parts = [np.abs(self.value[group == k]) for k in range(groups)]
-        scales = [ROBUST * float(np.median(one)) if len(one) else 0.0 for one in parts]
-        return [max(self.floor, AT_REST * one) for one in scales]
-
-    def plain(self, structure: Structure) -> Noise:
-        """Return white Gaussian noise: root mean squares of the residuals, `unit` for a sensor without any."""
-        group, groups = self.groups(structure)
-        count = np.bincount(group, minlength=groups)
-        mean = np.bincount(group, self.value**2, minlength=groups) / np.maximum(count, 1)
-        size = np.maximum(np.sqrt(np.where(count > 0, mean, 1.0)), self.floor) * self.unit
-        nothing = np.zeros(self.sensors)
-        return Noise(np.broadcast_to(size, self.sensors).copy(), 0.0, np.inf, nothing, structure)
-
-    def packed(self, noise: Noise, structure: Structure) -> Float[ndarray, " numbers"]:
-        """Return noise as numbers to vary: log sizes, log growth, 1 / nu, correlations over the typical interval.
-
-        Parts of the structure that the noise does not have get a start of their own; with growth, half of the variance.
-        """
-        size = noise.size if noise.structure.own_sizes or not structure.own_sizes else self.plain(structure).size
-        size = np.maximum(size / self.unit, self.floor)
-        if not structure.own_sizes:
-            size = np.exp(np.mean(np.log(size), keepdims=True))
-        numbers: list[ndarray] = []
-        if structure.growth:
-            growth = noise.growth
-            if not growth > 0:
-                growth = float(np.sqrt(np.mean(size**2) / 2 / np.mean(self.level**2)))
-                size = size / np.sqrt(2)
-            numbers.append(np.log([growth]))
-        if structure.tails:
-            known = np.isfinite(noise.tail)
-            size = size if known else size / np.sqrt(2)
-            numbers.append(np.array([1 / noise.tail if known else 0.2]))
-        if structure.memory:
-            time = noise.memory if structure.own_sizes else np.mean(noise.memory, keepdims=True)
-            time = np.where(time > 0, time, self.interval)
-            numbers.append(np.clip(np.exp(-self.interval / time), LEAST_CORRELATED, MOST_CORRELATED))
-        return np.concatenate([np.log(size), *numbers])
-
-    def unpacked(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> Noise:
-        """Return the noise that numbers of `packed` stand for."""
-        size, growth, tail, rho = self.parts(numbers, structure)
-        time = np.where(rho > 1.01 * LEAST_CORRELATED, -self.interval / np.log(np.maximum(rho, LEAST_CORRELATED)), 0.0)
-        everyone = np.ones(self.sensors)
-        return Noise(size * self.unit * everyone, growth, tail, time * everyone, structure)
-
-    def parts(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> tuple[ndarray, float, float, ndarray]:
-        """Return sizes, growth, degrees of freedom and correlations over the typical interval."""
-        groups = self.groups(structure)[1]
-        size, rest = np.exp(numbers[:groups]), list(numbers[groups:])
-        growth = float(np.exp(rest.pop(0))) if structure.growth else 0.0
-        tail = float(1 / rest.pop(0)) if structure.tails else np.inf
-        return size, growth, tail, np.array(rest) if structure.memory else np.zeros(groups)
-
-    def cost(self, numbers: Float[ndarray, " count"], structure: Structure) -> tuple[float, Float[ndarray, " count"]]:
-        """Return minus the mean log likelihood of a reading, and its gradient."""
-        size, growth, tail, near = self.parts(numbers, structure)
-        group, groups = self.groups(structure)
-        s = np.sqrt(size[group] ** 2 + (growth * self.level) ** 2) if structure.growth else size[group]
-        y = self.value / s
-        rho = np.zeros_like(y)
-        if structure.memory:
-            rho = np.where(self.linked, near[group] if self.even else near[group] ** self.gap, 0.0)
-            rho = np.minimum(rho, 1 - CLOSEST)
-        q = 1 / np.sqrt(1 - rho**2)
-        before = np.concatenate([[0.0], y[:-1]])
-        z = (y - rho * before) * q
-        slope = z if not structure.tails else (tail + 1) * z / (tail + z**2)
-        cost = np.sum(np.log(s)) - np.sum(np.log(q)) + _minus_log_density(z, tail)
-        # By y of each reading, which its own innovation and the next one depend on.
-        by_y = slope * q
-        by_y[:-1] -= (slope * q * rho)[1:]
-        by_size = 1 - by_y * y
-        share = (size[group] / s) ** 2 if structure.growth else np.ones_like(s)
-        gradient = [np.bincount(group, share * by_size, minlength=groups)]
-        if structure.growth:
-            gradient.append(np.array([np.sum((1 - share) * by_size)]))
-        if structure.tails:
-            gradient.append(np.array([-(tail**2) * _by_tail(z, tail)]))
-        if structure.memory:
-            by_rho = slope * (rho * q * z - before) * q - rho * q**2
-            by_near = by_rho * rho * np.where(self.linked, self.gap, 0.0) / near[group]
-            gradient.append(np.bincount(group, by_near, minlength=groups))
-        return float(cost) / len(y), np.concatenate(gradient) / len(y)

@@ -41,14 +41,15 @@ DEGREES = (0, 1, 3, 7)
 ABOVE, SHARE = 30.0, 3e-3
 # Outside influences are looked for up to so many times the highest frequency, at so many frequencies at most.
 FARTHER, MOST_FREQUENCIES = 6.0, 900
-# Multiples of its own frequencies that a motion shows where the equation or a sensor is not linear, up to this one.
-HARMONICS = 8
-# The share of the noise's variance that makes it one of rounding.
-ROUNDED = 0.5
+# Noise is at least this share of the swing: no instrument shows less, and motions are not computed more accurately.
+FINEST = 1e-6
 # A stretch that lasts so many times as long as its samples ask for holds a gap.
 GAP = 2.0
 # In typical times between readings; each is some steps of the integrator.
 LONGEST_GAP = 1000.0
+# Dry friction is viscous at first below this share of the usual speed: a fit that is far from the motion needs forces
+# without jumps.
+AT_REST = 0.1
 # So many sensors are looked at for steps before it is taken that there are none.
 FEW_SENSORS = 4
 
@@ -108,6 +109,7 @@ class Problem:
         degree: of the splines between them, of `DEGREES`.
         scene: where effects are placed.
         candidates: all effects in all places.
+        unrounded: where the mean error of rounded readings has been taken away, the smallest noise with it; else 0.
     """
 
     declared: Library
@@ -124,6 +126,7 @@ class Problem:
     candidates: tuple[Placed, ...]
     forced: tuple[Samples | None, ...] = ()
     degree: int = 3
+    unrounded: float = 0.0
 
     @classmethod
     def of(cls, declared: Library, order: int, data: Sequence[Samples], catalogue: Sequence[Effect]) -> Problem:
@@ -147,6 +150,7 @@ class Problem:
             far = max(plain.reach)
             plain = replace(plain, least_reach=(far, far) if first.sites > 2 * far else plain.reach)
         states = [_states(one, order) for one in data]
+        plain = replace(plain, rest=AT_REST * _speed(states))
         records, splines = zip(*(_record(*each, plain) for each in zip(data, forced, states, strict=True)), strict=True)
         widest = min(plain.reach) if first.ends == "unknown" else first.sites - 1
         levels = records[0].value.shape[1]
@@ -212,8 +216,20 @@ class Problem:
         return float(np.sqrt(np.nanmean(values**2)))
 
     @functools.cached_property
+    def finest(self) -> float:
+        """The smallest size of noise: a share of the root mean square of the readings about each sensor's mean."""
+        columns = [column for one in self.data for field in self._fields(one) for column in field.T]
+        seen = [column[np.isfinite(column)] for column in columns]
+        return FINEST * float(np.sqrt(np.mean([np.var(one) for one in seen if len(one)])))
+
+    @functools.cached_property
     def noise(self) -> Float[ndarray, " sensors"]:
         """The noise of each sensor by the readings alone: u of each site, then v; NaN where they do not tell."""
+        found = self._shown
+        return np.where(found > 0, np.maximum(found, self.finest), found)
+
+    @property
+    def _shown(self) -> Float[ndarray, " sensors"]:
         longest = max(self.data, key=lambda one: len(one.t))
         found = []
         for field in self._fields(longest):
@@ -255,29 +271,7 @@ class Problem:
 
     def price_of(self, placed: Placed) -> float:
         """Return the price of an effect in its place."""
-        return self.price(placed.effect.name, len(placed.numbers)) + self.locked(placed)
-
-    @functools.cached_property
-    def _rounded(self) -> bool:
-        """Whether rounding makes most of the noise; of a regular motion it leaves lines at high multiples."""
-        pairs = zip(self.steps, self.noise, strict=True)
-        return any(step**2 / 12 > ROUNDED * size**2 for step, size in pairs)
-
-    def locked(self, placed: Placed) -> float:
-        """Return what an influence costs besides that swings as the motion itself does, or a measured input may."""
-        if placed.effect.name in rules.FED:
-            return rules.LOCKED
-        omega = placed.frequency
-        if omega is None:
-            return 0.0
-        if self._rounded or self.scene.inputs:
-            return rules.LOCKED
-        width = 4 * np.pi / float(self.data[0].t[-1] - self.data[0].t[0])
-        own = self.spectrum.peaks[:4]
-        multiples = np.multiply.outer(np.arange(1, HARMONICS), own).ravel()
-        sums = np.abs([*multiples, *np.add.outer(own, own).ravel(), *np.subtract.outer(own, own).ravel()])
-        sums = sums[sums > width]
-        return rules.LOCKED if np.any(np.abs(sums - abs(omega)) < width) else 0.0
+        return self.price(placed.effect.name, len(placed.numbers))
 
 
 @functools.lru_cache(maxsize=4096)
@@ -365,6 +359,12 @@ def _states(samples: Samples, order: int) -> tuple[ndarray, ndarray | None]:
     return smooth(samples, order)
 
 
+def _speed(states: Sequence[tuple[ndarray, ndarray | None]]) -> float:
+    """Return the root mean square of smoothed velocities; 0 on a lattice of first order."""
+    squares = [np.mean(np.abs(v) ** 2) for _, v in states if v is not None]
+    return float(np.sqrt(np.nanmean(squares))) if squares else 0.0
+
+
 def _record(
     samples: Samples, forced: Samples | None, states: tuple[ndarray, ndarray | None], plain: Dynamics
 ) -> tuple[Record, ndarray | None]:
@@ -411,10 +411,11 @@ def turned(problem: Problem, site: int) -> Problem:
     return replace(problem, nodes=tuple(nodes * own for nodes in problem.nodes))
 
 
-def regressed(problem: Problem) -> tuple[float, ...]:
+def regressed(problem: Problem) -> tuple[tuple[float, ...], float]:
     """Return the declared coefficients that carry the smoothed states over a quarter of the shortest period.
 
-    Each site has a constant force besides, so that a sensor's offset does no harm.
+    Each site has a constant force besides, so that a sensor's offset does no harm. With the coefficients comes the
+    share of the forces' work that they leave (root mean square).
 
     Raises:
         InputError: a declared term is not finite along them.
@@ -445,7 +446,9 @@ def regressed(problem: Problem) -> tuple[float, ...]:
     design, target = np.concatenate(designs), np.concatenate(targets)
     size = np.sqrt(np.mean(design**2, axis=0))
     size[size == 0] = 1.0
-    return tuple(float(one) for one in np.linalg.lstsq(design / size, target, rcond=1e-6)[0] / size)
+    found = np.linalg.lstsq(design / size, target, rcond=1e-6)[0] / size
+    left = float(np.linalg.norm(target - design @ found) / max(float(np.linalg.norm(target)), 1e-300))
+    return tuple(float(one) for one in found), left
 
 
 def derivative_share(problem: Problem, motion: Sequence[ndarray], right: Sequence[ndarray]) -> float:

@@ -195,6 +195,8 @@ def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Predi
     """Return the best model after exchanges, without effects that make the forecast worse."""
     search.say("trying what could stand in the place of each effect")
     best = compared(search, found.models[0])
+    if not best.fitted.model.effects:
+        return best
     before, now = (pooled(foreseen(one)) for one in (found.before, best.fitted))
     of_u = best.fitted.rms[: search.problem.chain.sites]
     least = rules.BEYOND_NOISE * float(np.sqrt(np.nanmean(of_u**2))) / search.problem.height
@@ -234,7 +236,7 @@ def _diagnosis(
     if not after.model.effects:
         before = after
     named = findings(best)
-    noise = _noise(problem, after) if left else after.rms
+    noise = np.maximum(_noise(problem, after) if left else after.rms, problem.finest)
     more = len(after.model.numbers) - len(before.model.numbers)
     count = len(before.model.coefficients)
     comparable = before.longest == after.longest
@@ -276,7 +278,7 @@ def _over(fitted: Fitted, noise: ndarray) -> float:
 
 
 def _noise_lines(problem: Problem, after: Fitted) -> tuple[str, ...]:
-    return tuple(describe(after.noise, problem.steps, interval=problem.step))
+    return tuple(describe(after.noise, problem.steps, interval=problem.step, least=after.rows.least))
 
 
 def _dynamics(problem: Problem, fitted: Fitted) -> float:

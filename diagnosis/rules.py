@@ -14,12 +14,6 @@ NAMED = 5.0
 # Nats that an effect must bring besides if it has a number of its own for every site: it does the work of many others.
 STAND_IN = 10.0
 STAND_INS = frozenset({"disorder"})
-# Nats besides for an influence that swings at a frequency of the motion itself, a multiple or a sum: a wrong equation
-# leaves just that. Where rounding makes the noise, it leaves lines at any frequency; a wrong equation that an input
-# drives leaves lines wherever the input has some.
-LOCKED = 10.0
-# Effects that feed the motion with its own past: what they bring is such an influence, too.
-FED = frozenset({"memory"})
 # A wave or a pulse has to stand out from its surroundings: its price is as many times as high as others beside it win
 # what noise lets them, for where an equation misfits, every frequency or time near by wins something. Beside a wave are
 # those from so many steps of half a resolution away, where a line has fallen to a hundredth, up to so many; beside a
@@ -28,8 +22,8 @@ LINE, AROUND, APART, FEW_AROUND = 4, 24, 4.0, 8
 # Stretches of the recordings whose numbers are compared: where they differ by more than the noise lets them, all
 # evidence is that much less. Twice as many can hold twice the evidence of what is no noise; a few periods must fit in.
 STRETCHES = 32
-# Models that are carried to the next horizon, and how many nats they may be behind the best one.
-RIVALS, BEHIND = 3, 60.0
+# Models that are carried to the next horizon.
+RIVALS = 3
 # Candidates of each model that are fitted in full, those of the highest score first.
 TRIED = 4
 # A score is linear: a candidate may bring so many times what its score says.

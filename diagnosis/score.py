@@ -393,14 +393,14 @@ class Tangent:
         for number in range(int(np.max(sensor)) + 1):
             here = sensor == number
             count, total = float(np.sum(self._read[here])), float(np.sum(self.left[here] ** 2))
-            least = max(total, 1e-12 * count)
             after = np.sum((self.left[here, None] - does[here]) ** 2, axis=0)
-            gains -= 0.5 * count * np.log(np.maximum(after / least, 1e-6)) if count else 0.0
+            gains += gain(total, after, count, self.fitted.least[number]) if count else 0.0
         return [float(one) for one in gains]
 
     def _gain(self, won: float) -> float:
         """Return the nats that so much of the sum of squares is worth, the size of the noise being free."""
-        return gain(won, self.error, float(np.sum(np.isfinite(self.fitted.followed.left))))
+        total, count = float(np.sum(self.error**2)), float(np.sum(self._read))
+        return float(gain(total, total - won, count, np.min(self.fitted.least)))
 
     def _columns(self, number: int, batch: Sequence[Placed]) -> ndarray:
         """Return what the numbers of effects do to the readings of one recording: (rows, channels, numbers)."""

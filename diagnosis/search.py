@@ -19,13 +19,16 @@ from latticebench.diagnosis.border import MOST
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.horizon import Layout, unread
 from latticebench.diagnosis.inputs import interpolations, likeliest
+from latticebench.diagnosis.mirrored import images, mirrored
 from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.noise import Structure, estimate
+from latticebench.diagnosis.noise import Structure
+from latticebench.diagnosis.noise_estimate import estimate
 from latticebench.diagnosis.past import past_of, settled
-from latticebench.diagnosis.problem import Problem, regressed, turned
+from latticebench.diagnosis.problem import Problem, regressed
 from latticebench.diagnosis.progress import Found, Horizon, Tried
+from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
-from latticebench.diagnosis.worth import COUPLING, Worth, beyond, fine, misfits, over, repelling, same, wald
+from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, same, wald
 
 Watcher = Callable[[str], None]
 
@@ -33,6 +36,9 @@ Watcher = Callable[[str], None]
 ROWS, PIECES = 1200, 4
 # Errors of the integrator become smaller where what is left does by this factor.
 FINER = 4.0
+# From one fit to the next dry friction acts like a viscous one below a speed so many times as low, down to this share
+# of the first, while that brings so many nats.
+SHARPER, ABRUPT, HELPED = 3.0, 0.02, 0.5
 # Gauss-Newton steps of a first fit, of one at the next horizon, and of one with an effect more or less.
 FIRST, CARRIED, CHANGED = 40, 25, 10
 # A model that cannot be followed over long pieces at once begins on the second horizon and climbs so many at a time.
@@ -43,8 +49,6 @@ DOUBT = 8.0
 MOST_MOVES = 5e6
 # A candidate may take the place of an effect if it can do this share of what the effect does.
 MOST_OF_IT = 0.9
-# Sensors are tried from the other side on chains of so many sites at most.
-MOST_TURNED = 3
 # A misfit grows with the signal, too: noise is taken to do so only where no more than so many times the noise is left.
 NEAR = 2.0
 # On so few sensors each has a size and a correlation of its own whether or not that is plain.
@@ -59,7 +63,7 @@ class Search:
     def __init__(self, problem: Problem, watcher: Watcher) -> None:
         self.problem, self.say = problem, watcher
         self.structure = Structure()
-        self.small = fine(problem)
+        self.small, self.memory = fine(problem), 0.0
         self.tried: dict[tuple[str, ...], tuple[Tried, ...]] = {}
         self.open: tuple[Placed, ...] = problem.candidates
         self.lengths: list[int] = []
@@ -95,6 +99,10 @@ class Search:
             last = Found(before, tuple(best), done)
             yield last
             length = self._next(length, settled)
+            followed = [one for one in (before, *best) if one.longest == best[0].longest]
+            if not length and (finer := without_rounding(self.problem, followed, self.value)) is not None:
+                self.problem, length = finer, self._longest
+                self.say("taking away what rounding adds to the readings")
             carried = self._carried(last, length) if length else []
 
     def _at_once(self, first: list[Fitted]) -> list[Fitted]:
@@ -114,7 +122,7 @@ class Search:
     @functools.cached_property
     def _declared(self) -> Model:
         """The declared equation, with the numbers that a regression gives it."""
-        return Model(self.problem.declared, self.problem.order, regressed(self.problem))
+        return Model(self.problem.declared, self.problem.order, regressed(self.problem)[0])
 
     def _begun(self, model: Model, seen: Problem, layout: Layout, steps: int = FIRST) -> Fitted | None:
         """Return the first fit of a model, from smoothed readings as they are seen."""
@@ -148,7 +156,7 @@ class Search:
     def layout(self, length: int, problem: Problem | None = None) -> Layout:
         """Return pieces of a length: of all rows on long horizons, of some on short ones."""
         most = None if length >= self._longest else max(ROWS, PIECES * length)
-        return Layout.of(problem or self.problem, length, most, self.small)
+        return Layout.of(problem or self.problem, length, most, self.small, self.memory)
 
     def _first(self, length: int) -> list[Fitted]:
         """Return the declared equation, and the rivals that begin the search."""
@@ -158,7 +166,7 @@ class Search:
         still = replace(start, coefficients=(0.0,) * len(start.coefficients))
         fits: list[Fitted] = []
         at_once = [(start.with_effect(one), problem) for one in problem.candidates if one.from_the_start]
-        for model, seen in ((start, problem), (still, problem), *at_once, *self._mirrored(start)):
+        for model, seen in ((start, problem), (still, problem), *at_once, *mirrored(problem, start)):
             if model is still and fits:
                 continue
             found = self._begun(model, seen, layout)
@@ -169,52 +177,11 @@ class Search:
         self._choose_structure(fits[0])
         return [fits[0], *fits]
 
-    def _mirrored(self, start: Model) -> list[tuple[Model, Problem]]:
-        """Return the declared equation with one sensor that looks from the other side, and the states it then has."""
-        found = []
-        for one in self._sensors() if repelling(self.problem, start) else ():
-            other = one.turned()
-            if other is not None and one.site is not None:
-                seen = turned(self.problem, one.site)
-                model = replace(start, coefficients=regressed(seen))
-                if not repelling(self.problem, model):
-                    found.append((model.with_effect(other), seen))
-        return found
-
-    def _sensors(self) -> list[Placed]:
-        """Return what can be said of single sensors' sign, all but the first one's."""
-        if self.problem.chain.sites > MOST_TURNED:
-            return []
-        return [one for one in self.problem.candidates if one.turned() is not None and one.site != 0]
-
-    def _other_side(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
-        """Yield the mirror image of a chain of two whose sites push each other away: its second sensor is turned.
-
-        With w = -u of the second site, C (w - u) + k u is -C (u2 - u) + (k + 2 C) u of the first, and the like.
-        """
-        texts = list(fitted.model.declared.texts)
-        if self.problem.chain.sites != 2 or not repelling(self.problem, fitted.model) or "u[n]" not in texts:
-            return
-        coefficients = list(fitted.model.coefficients)
-        pull, own = texts.index(COUPLING), texts.index("u[n]")
-        coefficients[own] -= 2 * coefficients[pull]
-        coefficients[pull] *= -1
-        plain = replace(fitted.model, coefficients=tuple(coefficients))
-        for one in self._sensors():
-            there = [k for k, placed in enumerate(plain.effects) if placed.place == one.place]
-            model = plain.without(there[0]) if there else plain
-            other = (plain.effects[there[0]] if there else one).turned()
-            if other is not None and model.with_effect(other).key not in pool:
-                sign = np.tile([1.0, -1.0], self.problem.chain.order)
-                near = [nodes * sign for nodes in fitted.followed.nodes]
-                found = self.refit(model.with_effect(other), fitted.layout, near, fitted, CHANGED)
-                if found is not None:
-                    yield found
-
     def _choose_structure(self, fitted: Fitted) -> None:
         """Let the readings choose the parts of the noise model that all models of a horizon share."""
         followed = fitted.followed
-        found = estimate(followed.left, followed.swing, fitted.rows).structure
+        noise = estimate(followed.left, followed.swing, fitted.rows)
+        found, self.memory = noise.structure, float(np.mean(noise.memory))
         few = len(fitted.rms) <= FEW_SENSORS
         growth = found.growth and beyond(self.problem, fitted) < NEAR
         self.structure = replace(found, growth=growth, own_sizes=found.own_sizes or few, memory=found.memory or few)
@@ -253,7 +220,36 @@ class Search:
         steps: int,
         hope: float = np.inf,
     ) -> Fitted | None:
-        """Return the fit of a model; None where it cannot be followed or comes to no cost below `hope`."""
+        """Return the fit of a model; None where it cannot be followed or comes to no cost below `hope`.
+
+        Dry friction is made more abrupt from fit to fit, as long as that helps.
+        """
+        if not model.rubs:
+            return self._refit(model, layout, near, start, steps, hope)
+        soft = self.problem.plain.rest
+        known = start.layout.plain.rest if start is not None and start.model.rubs else soft
+        found = None
+        for rest in sorted({known, soft}):
+            resting = layout.resting(rest).with_substeps(model, near, self.problem.top)
+            found = found or self._refit(model, resting, near, start, steps)
+        while found is not None and found.layout.plain.rest > ABRUPT * soft:
+            resting = found.layout.resting(found.layout.plain.rest / SHARPER)
+            resting = resting.with_substeps(found.model, found.followed.nodes, self.problem.top)
+            sharper = self._refit(found.model, resting, found.followed.nodes, found, steps, found.cost - HELPED)
+            if sharper is None:
+                break
+            found = sharper
+        return found if found is not None and found.cost < hope else None
+
+    def _refit(
+        self,
+        model: Model,
+        layout: Layout,
+        near: list[np.ndarray] | tuple[np.ndarray, ...],
+        start: Fitted | None,
+        steps: int,
+        hope: float = np.inf,
+    ) -> Fitted | None:
         noise = None if start is None else start.noise
         known = start is not None and start.layout.borders is layout.borders
         splines = start.followed.splines if start is not None and known else None
@@ -270,7 +266,7 @@ class Search:
             return found
         # What is left has become so little that the integrator's errors count.
         finer = replace(layout, small=small).with_substeps(found.model, found.followed.nodes, self.problem.top)
-        return self.refit(found.model, finer, found.followed.nodes, found, steps, hope)
+        return self._refit(found.model, finer, found.followed.nodes, found, steps, hope)
 
     # One horizon ------------------------------------------------------------------------------------------------------
 
@@ -302,7 +298,7 @@ class Search:
         ranked = sorted(pool.values(), key=self.value)
         found: list[Fitted] = []
         for one in ranked:
-            if self.value(one) > self.value(ranked[0]) + rules.BEHIND or len(found) == rules.RIVALS:
+            if len(found) == rules.RIVALS:
                 break
             if not any(same(one, other) for other in found):
                 found.append(one)
@@ -322,7 +318,10 @@ class Search:
                 if found is not None:
                     yield found
         yield from self._exchanged(fitted, pool)
-        yield from self._other_side(fitted, pool)
+        for other, near in images(self.problem, fitted):
+            found = None if other.key in pool else self.refit(other, fitted.layout, near, fitted, CHANGED)
+            if found is not None:
+                yield found
         if len(model.effects) < rules.MOST_EFFECTS:
             timed = ahead == np.inf or not model.effects
             start, likely = self._likely(fitted, timed)
@@ -446,7 +445,7 @@ class Search:
         tried: dict[str, Tried] = {}
         for one in tangent.scored(absent):
             name = one.placed.effect.name
-            price = self.problem.price(name, one.freedom) + self.problem.locked(one.placed)
+            price = self.problem.price(name, one.freedom)
             if name not in tried or one.gain - price > tried[name].gain - tried[name].price:
                 tried[name] = Tried(name, one.gain, price)
             if one.placed.frequency is not None and one.gain > price:

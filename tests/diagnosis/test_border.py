@@ -79,3 +79,20 @@ def test_standard_errors_hold_where_the_border_is_noisy():
         wrong.append((np.array(found.model.coefficients) - TRUTH) / found.stderr)
     # Of 40 values; the mean square of normal ones is 0.6 to 1.5 in 95 of 100 cases.
     assert 0.4 < np.mean(np.square(wrong)) < 1.8
+
+
+def test_curves_of_the_border_follow_no_noise_that_has_a_memory():
+    from scipy.signal import lfilter
+
+    one = problem(3, noise=0.0)
+    record = one.records[0]
+    rho, draw = 0.8, np.random.default_rng(4)
+    noise = 0.05 * lfilter([np.sqrt(1 - rho**2)], [1, -rho], draw.normal(size=record.value.shape), axis=0)
+    noisy = replace(one, records=(replace(record, value=record.value + noise),))
+    memory = (T[1] - T[0]) / -np.log(rho)
+    clean, blind, told = (
+        Layout.of(each, 301, None, 1e-4, time).borders[0].basis.count
+        for each, time in ((one, 0.0), (noisy, 0.0), (noisy, memory))
+    )
+    assert told < 0.6 * blind
+    assert told < clean

@@ -116,7 +116,7 @@ def test_a_fit_finds_coefficients_and_the_noise_of_each_sensor():
     problem = Problem.of(DECLARED, 2, [recording(EVEN, sizes)], CATALOGUE)
     layout = Layout.of(problem, len(EVEN), None, 1e-4)
     states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
-    found = fit(Model(DECLARED, 2, regressed(problem)), layout, states, structure=Structure(own_sizes=True))
+    found = fit(Model(DECLARED, 2, regressed(problem)[0]), layout, states, structure=Structure(own_sizes=True))
     assert found.converged
     np.testing.assert_allclose(found.noise.deviation(), sizes, rtol=0.15)
     np.testing.assert_allclose(found.rms, sizes, rtol=0.15)
@@ -136,7 +136,7 @@ def right_and_wrong():
         problem = Problem.of(one, 2, [recording(t, 2e-4, velocities=False)], CATALOGUE)
         layout = Layout.of(problem, 40, None, 2e-6)
         states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
-        found.append((problem, fit(Model(one, 2, regressed(problem)), layout, states, structure=Structure())))
+        found.append((problem, fit(Model(one, 2, regressed(problem)[0]), layout, states, structure=Structure())))
     return found
 
 
@@ -192,7 +192,7 @@ def test_the_declared_coefficients_to_start_from_are_near_those_that_made_the_da
     for offset in (0.0, 0.5):
         shifted = replace(data, u=data.u + offset * np.eye(SITES)[2])
         linear = library("linear", "u[n+1]+u[n-1]-2*u[n]; u[n]")
-        found = regressed(Problem.of(linear, 2, [shifted], CATALOGUE))
+        found = regressed(Problem.of(linear, 2, [shifted], CATALOGUE))[0]
         np.testing.assert_allclose(found, [2.0, -2.8], rtol=0.1)
 
 

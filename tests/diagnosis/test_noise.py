@@ -10,7 +10,8 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from latticebench.diagnosis.fitting import spread
-from latticebench.diagnosis.noise import Noise, Rows, Structure, estimate
+from latticebench.diagnosis.noise import Noise, Rows, Structure
+from latticebench.diagnosis.noise_estimate import estimate
 
 EVERY_PART = Structure(own_sizes=True, growth=True, tails=True, memory=True)
 
@@ -303,3 +304,24 @@ def test_noise_that_grows_from_nothing_keeps_a_size_at_zero_signal():
     found = estimate(left, level, rows, structure=Structure(own_sizes=True, growth=True))
     assert np.all(found.size > 0.05 * np.median(np.abs(left), axis=0))
     assert found.growth == pytest.approx(0.01, rel=0.2)
+
+
+def test_a_sensor_whose_noise_a_curve_follows_takes_its_memory_from_the_others():
+    from scipy.interpolate import make_lsq_spline
+
+    rows, true = rows_of(2000, 4), made_of(size=(0.5, 1.0, 1.0, 1.0), memory=(0.4,) * 4)
+    left = draw_of(true, np.zeros((2000, 4)), rows, 5)
+    knots = np.linspace(rows.times[0], rows.times[-1], 402)
+    inner = np.concatenate([[knots[0]] * 3, knots, [knots[-1]] * 3])
+    left[:, 0] -= make_lsq_spline(rows.times, left[:, 0], inner)(rows.times)
+    free = np.array([404.0, 0, 0, 0])
+    structure = Structure(own_sizes=True, memory=True)
+    seen, told = (
+        estimate(left, np.zeros_like(left), one, free=free, structure=structure)
+        for one in (rows, replace(rows, curved=frozenset([0])))
+    )
+    np.testing.assert_allclose(told.size, true.size, rtol=0.1)
+    np.testing.assert_allclose(told.memory, true.memory, rtol=0.2)
+    # Its own residual shows next to nothing of it.
+    assert seen.memory[0] < 0.1
+    assert seen.size[0] < 0.3

@@ -1,0 +1,321 @@
+"""The noise under which residuals are most likely, and which of its parts they show."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.diagnosis.noise import CLOSEST, Noise, Rows, Structure, chained, minus_log_density
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+    from numpy import ndarray
+
+    from latticebench.diagnosis.noise import Readings
+
+# A size is at least this share of the level's root mean square: arithmetic with doubles is no more accurate.
+FLOOR = 1e-12
+# Where noise grows with the signal, at zero signal it is at least this share of its median; and the standard deviation
+# of a Gaussian over its median absolute value.
+AT_REST, ROBUST = 0.1, 1.4826
+# Below 2 degrees of freedom there is no variance; closer to 2 it rests on a handful of outliers.
+HEAVIEST = 2.5
+# Beyond, Student's t is a Gaussian for any record.
+LIGHTEST = 1000.0
+# Correlations from one typical reading to the next. A stronger one than the largest may stand for any slow misfit of
+# the equation, which the equation should have to answer for; below the least, the noise is white.
+MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
+# Nats that each part of the structure must win beyond Schwarz' penalty. Four parts are tried, on records of less than a
+# hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100 records.
+MARGIN = 2.0
+# Readings that the structure is chosen from, in stretches all over a longer record: what so many do not show changes
+# sizes by less than a per cent.
+GLANCE, STRETCHES = 20_000, 10
+# Of a sensor's readings a fit leaves at least this share free.
+SPARE = 0.2
+# Steps to the size of a sensor whose noise is otherwise known: each takes it most of the way.
+LENT = 8
+
+
+def estimate(
+    left: Readings, level: Readings, rows: Rows, *, free: Float[ndarray, " sensors"] | float = 0.0,
+    structure: Structure | None = None, start: Noise | None = None,
+) -> Noise:  # fmt: skip
+    """Return the noise under which residuals are most likely.
+
+    Args:
+        left: readings less what a model says, NaN where nothing was read.
+        level: what the model says, in the same units.
+        rows: times and sensors of both.
+        free: how many numbers the fit of the model took from the n readings, of each sensor or of all together. Such a
+            fit leaves residuals that are too small: sizes are multiplied by sqrt(n / (n - free)).
+        structure: which parts to use; chosen by Schwarz' criterion if left out.
+        start: where to start, such as the noise at the last step of an iteration.
+    """
+    task = _Task.of(left, level, rows)
+    curved = np.isin(rows.sensor, list(rows.curved))
+    plain = np.where(curved, np.nan, left) if np.any(curved) and np.any(np.isfinite(left[:, ~curved])) else left
+    if structure is None:
+        start = _chosen(_Task.of(*_glance(plain, level, rows)))
+        structure = start.structure
+    if plain is left:
+        found = task.best(structure, start)[0]
+    else:
+        found = task.lent(_Task.of(plain, level, rows).best(structure, start)[0], rows.curved)
+    everything, taken = len(task.value), float(np.sum(free))
+    scale = float(np.sqrt(everything / max(everything - taken, 1.0))) if everything else 1.0
+    own = np.full(task.sensors, scale)
+    if np.ndim(free) and found.structure.own_sizes:
+        count = np.bincount(task.sensor, minlength=task.sensors)
+        own = np.sqrt(np.maximum(count, 1) / np.maximum(count - free, SPARE * np.maximum(count, 1)))
+    return replace(found, size=found.size * own, growth=found.growth * scale)
+
+
+def _glance(left: ndarray, level: ndarray, rows: Rows) -> tuple[ndarray, ndarray, Rows]:
+    """Return stretches of a long record, each a piece of its own; of a short one all there is."""
+    count, kept = len(rows.times), GLANCE // max(len(rows.sensor), 1)
+    if count <= kept:
+        return left, level, rows
+    begin = np.linspace(0, count - kept // STRETCHES, STRETCHES).astype(int)
+    few = (begin[:, None] + np.arange(kept // STRETCHES)).ravel()
+    first = rows.first[few]
+    first[:: kept // STRETCHES] = True
+    return left[few], level[few], replace(rows, times=rows.times[few], first=first)
+
+
+def _chosen(task: _Task) -> Noise:
+    """Return the noise of the structure that Schwarz' criterion prefers, found step by step.
+
+    One part is added or taken away at a time, whichever helps most, until nothing helps: what one part did alone may
+    later be done better by another.
+    """
+    tried: dict[Structure, tuple[float, Noise]] = {}
+
+    def price(structure: Structure, near: Noise | None) -> float:
+        if structure not in tried:
+            noise, likelihood = task.best(structure, near)
+            each = np.log(max(len(task.value), 1)) / 2
+            tried[structure] = each * noise.parameters + MARGIN * sum(vars(structure).values()) - likelihood, noise
+        return tried[structure][0]
+
+    here = Structure()
+    price(here, None)
+    while not task.is_exact():
+        found = tried[here][1]
+        ways = [replace(here, **{part: not getattr(here, part)}) for part in task.possible]
+        best = min(ways, key=lambda one: price(one, found))
+        if tried[best][0] >= tried[here][0]:
+            break
+        here = best
+    return tried[here][1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """Residuals in their order and in units of their own: their largest scale and the typical interval are 1.
+
+    Attributes:
+        value, level, sensor: residual and absolute level, divided by `unit`, and sensor of each reading.
+        gap, linked: interval to the reading before, divided by `interval`, and whether there is one.
+        even: whether all intervals are alike.
+        unit, interval: root mean square of the residuals and median interval.
+        floor: least size, divided by `unit`.
+        possible: parts of a structure that can make a difference.
+    """
+
+    value: Float[ndarray, " readings"]
+    level: Float[ndarray, " readings"]
+    sensor: Int[ndarray, " readings"]
+    gap: Float[ndarray, " readings"]
+    linked: Bool[ndarray, " readings"]
+    even: bool
+    unit: float
+    interval: float
+    floor: float
+    sensors: int
+    possible: tuple[str, ...]
+
+    @classmethod
+    def of(cls, left: Readings, level: Readings, rows: Rows) -> _Task:
+        chain = chained(rows, np.isfinite(left))
+        value, heights = chain.of(left), np.abs(chain.of(level))
+        height = float(np.sqrt(np.mean(heights**2))) if len(heights) else 0.0
+        floor = max(FLOOR * height, rows.least, np.finfo(float).tiny ** 0.5)
+        unit = max(float(np.sqrt(np.mean(value**2))) if len(value) else 0.0, floor)
+        linked = np.isfinite(chain.gap)
+        apart = linked & (chain.gap > 0)
+        interval = float(np.median(chain.gap[apart])) if np.any(apart) else 1.0
+        gap = np.where(linked, chain.gap, 0.0) / interval
+        sensors = int(np.max(rows.sensor, initial=-1)) + 1
+        ways = {"own_sizes": sensors > 1, "growth": height > 0, "tails": True, "memory": bool(np.any(apart))}
+        return cls(
+            value / unit, heights / unit, chain.sensor, gap, linked, bool(np.all(np.abs(gap[linked] - 1) < 1e-6)),
+            unit, interval, floor / unit, sensors, tuple(part for part, there in ways.items() if there),
+        )  # fmt: skip
+
+    def is_exact(self) -> bool:
+        """Whether the residuals are no more than what arithmetic leaves."""
+        return self.floor >= 1 or not len(self.value)
+
+    def groups(self, structure: Structure) -> tuple[Int[ndarray, " readings"], int]:
+        """Return the group of each reading and the number of groups; sensors of a group share size and memory."""
+        if structure.own_sizes:
+            return self.sensor, self.sensors
+        return np.zeros_like(self.sensor), 1
+
+    def best(self, structure: Structure, start: Noise | None) -> tuple[Noise, float]:
+        """Return the noise of greatest likelihood with a given structure, and its log likelihood."""
+        from scipy.optimize import minimize
+
+        structure = replace(structure, **{part: False for part in vars(structure) if part not in self.possible})
+        plain = self.plain(structure)
+        if not len(self.value):
+            return plain, 0.0
+        numbers = self.packed(start or plain, structure)
+        if self.is_exact() or not (structure.growth or structure.tails or structure.memory):
+            numbers = self.packed(plain, structure)
+            found, cost = plain, self.cost(numbers, structure)[0]
+        else:
+            groups = self.groups(structure)[1]
+            bounds = [(np.log(least), np.log(1e3)) for least in self.least(structure)]
+            bounds += [(np.log(1e-6), np.log(1e6))] * structure.growth
+            bounds += [(1 / LIGHTEST, 1 / HEAVIEST)] * structure.tails
+            bounds += [(LEAST_CORRELATED, MOST_CORRELATED)] * (groups * structure.memory)
+            result = minimize(
+                self.cost, numbers, args=(structure,), jac=True, method="L-BFGS-B", bounds=bounds,
+                options={"ftol": 1e-4 / len(self.value), "gtol": 1e-5, "maxiter": 200},
+            )  # fmt: skip
+            found, cost = self.unpacked(np.asarray(result.x), structure), float(result.fun)
+        return found, -len(self.value) * (cost + float(np.log(self.unit)))
+
+    def lent(self, noise: Noise, curved: Collection[int]) -> Noise:
+        """Return the noise of all sensors, of which some have a size of their own and all else from the others."""
+        if not noise.structure.own_sizes:
+            return noise
+        borrows = np.isin(np.arange(self.sensors), list(curved))
+        memory = np.where(borrows, np.mean(noise.memory[~borrows]), noise.memory)
+        first = self.plain(noise.structure).size / (np.sqrt(2) if np.isfinite(noise.tail) else 1.0)
+        found = replace(noise, size=np.where(borrows, first, noise.size), memory=memory)
+        for _ in range(LENT):
+            size = np.maximum(found.size * np.sqrt(self.excess(found)), self.floor * self.unit)
+            found = replace(found, size=np.where(borrows, size, noise.size))
+        return found
+
+    def excess(self, noise: Noise) -> Float[ndarray, " sensors"]:
+        """Return by how much the variance of each sensor's innovations is beyond that of the noise, weighed by it."""
+        s = np.hypot(noise.size[self.sensor] / self.unit, noise.growth * self.level)
+        time = noise.memory[self.sensor] / self.interval
+        rho = np.where(self.linked & (time > 0), np.exp(-self.gap / np.where(time > 0, time, 1.0)), 0.0)
+        rho = np.minimum(rho, 1 - CLOSEST)
+        y = self.value / s
+        z = (y - rho * np.concatenate([[0.0], y[:-1]])) / np.sqrt(1 - rho**2)
+        square = z**2 if not np.isfinite(noise.tail) else (noise.tail + 1) * z**2 / (noise.tail + z**2)
+        count = np.bincount(self.sensor, minlength=self.sensors)
+        mean = np.bincount(self.sensor, square, minlength=self.sensors) / np.maximum(count, 1)
+        return np.where(mean > 0, mean, 1.0)
+
+    def least(self, structure: Structure) -> list[float]:
+        """Return the least size of each group, divided by `unit`.
+
+        Of noise that grows with the signal it is a share of the residuals' scale: with none at zero signal the
+        likelihood has no bound, as readings near zero are then beyond all doubt.
+        """
+        group, groups = self.groups(structure)
+        if not structure.growth:
+            return [self.floor] * groups
+        parts = [np.abs(self.value[group == k]) for k in range(groups)]
+        scales = [ROBUST * float(np.median(one)) if len(one) else 0.0 for one in parts]
+        return [max(self.floor, AT_REST * one) for one in scales]
+
+    def plain(self, structure: Structure) -> Noise:
+        """Return white Gaussian noise: root mean squares of the residuals, `unit` for a sensor without any."""
+        group, groups = self.groups(structure)
+        count = np.bincount(group, minlength=groups)
+        mean = np.bincount(group, self.value**2, minlength=groups) / np.maximum(count, 1)
+        size = np.maximum(np.sqrt(np.where(count > 0, mean, 1.0)), self.floor) * self.unit
+        nothing = np.zeros(self.sensors)
+        return Noise(np.broadcast_to(size, self.sensors).copy(), 0.0, np.inf, nothing, structure)
+
+    def packed(self, noise: Noise, structure: Structure) -> Float[ndarray, " numbers"]:
+        """Return noise as numbers to vary: log sizes, log growth, 1 / nu, correlations over the typical interval.
+
+        Parts of the structure that the noise does not have get a start of their own; with growth, half of the variance.
+        """
+        size = noise.size if noise.structure.own_sizes or not structure.own_sizes else self.plain(structure).size
+        size = np.maximum(size / self.unit, self.floor)
+        if not structure.own_sizes:
+            size = np.exp(np.mean(np.log(size), keepdims=True))
+        numbers: list[ndarray] = []
+        if structure.growth:
+            growth = noise.growth
+            if not growth > 0:
+                growth = float(np.sqrt(np.mean(size**2) / 2 / np.mean(self.level**2)))
+                size = size / np.sqrt(2)
+            numbers.append(np.log([growth]))
+        if structure.tails:
+            known = np.isfinite(noise.tail)
+            size = size if known else size / np.sqrt(2)
+            numbers.append(np.array([1 / noise.tail if known else 0.2]))
+        if structure.memory:
+            time = noise.memory if structure.own_sizes else np.mean(noise.memory, keepdims=True)
+            time = np.where(time > 0, time, self.interval)
+            numbers.append(np.clip(np.exp(-self.interval / time), LEAST_CORRELATED, MOST_CORRELATED))
+        return np.concatenate([np.log(size), *numbers])
+
+    def unpacked(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> Noise:
+        """Return the noise that numbers of `packed` stand for."""
+        size, growth, tail, rho = self.parts(numbers, structure)
+        time = np.where(rho > 1.01 * LEAST_CORRELATED, -self.interval / np.log(np.maximum(rho, LEAST_CORRELATED)), 0.0)
+        everyone = np.ones(self.sensors)
+        return Noise(size * self.unit * everyone, growth, tail, time * everyone, structure)
+
+    def parts(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> tuple[ndarray, float, float, ndarray]:
+        """Return sizes, growth, degrees of freedom and correlations over the typical interval."""
+        groups = self.groups(structure)[1]
+        size, rest = np.exp(numbers[:groups]), list(numbers[groups:])
+        growth = float(np.exp(rest.pop(0))) if structure.growth else 0.0
+        tail = float(1 / rest.pop(0)) if structure.tails else np.inf
+        return size, growth, tail, np.array(rest) if structure.memory else np.zeros(groups)
+
+    def cost(self, numbers: Float[ndarray, " count"], structure: Structure) -> tuple[float, Float[ndarray, " count"]]:
+        """Return minus the mean log likelihood of a reading, and its gradient."""
+        size, growth, tail, near = self.parts(numbers, structure)
+        group, groups = self.groups(structure)
+        s = np.sqrt(size[group] ** 2 + (growth * self.level) ** 2) if structure.growth else size[group]
+        y = self.value / s
+        rho = np.zeros_like(y)
+        if structure.memory:
+            rho = np.where(self.linked, near[group] if self.even else near[group] ** self.gap, 0.0)
+            rho = np.minimum(rho, 1 - CLOSEST)
+        q = 1 / np.sqrt(1 - rho**2)
+        before = np.concatenate([[0.0], y[:-1]])
+        z = (y - rho * before) * q
+        slope = z if not structure.tails else (tail + 1) * z / (tail + z**2)
+        cost = np.sum(np.log(s)) - np.sum(np.log(q)) + minus_log_density(z, tail)
+        # By y of each reading, which its own innovation and the next one depend on.
+        by_y = slope * q
+        by_y[:-1] -= (slope * q * rho)[1:]
+        by_size = 1 - by_y * y
+        share = (size[group] / s) ** 2 if structure.growth else np.ones_like(s)
+        gradient = [np.bincount(group, share * by_size, minlength=groups)]
+        if structure.growth:
+            gradient.append(np.array([np.sum((1 - share) * by_size)]))
+        if structure.tails:
+            gradient.append(np.array([-(tail**2) * _by_tail(z, tail)]))
+        if structure.memory:
+            by_rho = slope * (rho * q * z - before) * q - rho * q**2
+            by_near = by_rho * rho * np.where(self.linked, self.gap, 0.0) / near[group]
+            gradient.append(np.bincount(group, by_near, minlength=groups))
+        return float(cost) / len(y), np.concatenate(gradient) / len(y)
+
+
+def _by_tail(z: Float[ndarray, " readings"], tail: float) -> float:
+    """Return the derivative of `minus_log_density` by the degrees of freedom."""
+    from scipy.special import digamma
+
+    share = z**2 / tail
+    constant = (digamma(tail / 2) - digamma((tail + 1) / 2) + 1 / tail) / 2
+    return float(np.sum(np.log1p(share) - (tail + 1) / tail * share / (1 + share)) / 2 + len(z) * constant)

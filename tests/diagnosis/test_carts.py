@@ -1,0 +1,65 @@
+"""What carts on a bench do: they rub until they stand still, and their sensors face each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from latticebench.diagnosis.repair import diagnose
+from latticebench.systems.effects import CATALOGUE
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+
+OMEGA, FRICTION, SWING, NOISE = 3.0, 0.35, 1.0, 0.005
+STIFF, SOFT = 9.0, 3.0
+
+
+def rubbing(t):
+    """Return u of u'' = -omega^2 u - friction sign(v), let go at `SWING`, in closed form.
+
+    From turn to turn it is a cosine about friction / omega^2 on the side that it comes from; where it turns within
+    that distance of zero, it stays.
+    """
+    middle, turn = FRICTION / OMEGA**2, SWING
+    found = np.empty_like(t)
+    for half in range(len(t)):
+        begin = half * np.pi / OMEGA
+        later = t >= begin
+        if abs(turn) <= middle:
+            found[later] = turn
+            return found
+        about = middle * np.sign(turn)
+        found[later] = about + (turn - about) * np.cos(OMEGA * (t[later] - begin))
+        turn = 2 * about - turn
+    raise AssertionError("it never stops")
+
+
+def test_friction_is_named_though_it_brings_the_motion_to_a_stop_within_the_recording():
+    t = np.linspace(0, 20, 500)
+    u = rubbing(t)
+    # A third of the recording is at rest, off the middle.
+    assert np.all(u[-150:] == u[-1])
+    assert abs(u[-1]) > 2 * NOISE
+    readings = u + NOISE * np.random.default_rng(1).normal(size=len(t))
+    found = diagnose(library("one", "u[n]"), 2, [Samples(t, readings[:, None], ends="fixed")], CATALOGUE)
+    assert found.verdict == "explained"
+    (friction,) = found.findings
+    assert friction.name == "dry-friction"
+    value, error = friction.values["sign(v[n])"]
+    assert abs(value + FRICTION) < 4 * error
+    assert found.residual[1] < 1.1
+
+
+@pytest.mark.parametrize("terms", ["u[n+1]+u[n-1]-2*u[n]", "u[n+1]+u[n-1]-2*u[n]; u[n]"])
+def test_sensors_that_face_each_other_are_told_from_a_repulsion_whether_or_not_a_spring_at_each_site_is_declared(terms):
+    t = np.linspace(0, 40, 600)
+    # Two carts between walls: modes of stiffness STIFF and STIFF + 2 SOFT, between walls and between carts.
+    both, between = np.cos(np.sqrt(STIFF) * t), 0.8 * np.cos(np.sqrt(STIFF + 2 * SOFT) * t)
+    first, second = (both + between) / 2, (both - between) / 2
+    draw = np.random.default_rng(2)
+    readings = np.stack([first, -second], axis=1) + NOISE * draw.normal(size=(len(t), 2))
+    found = diagnose(library("two", terms), 2, [Samples(t, readings, ends="fixed")], CATALOGUE)
+    assert found.verdict == "explained"
+    names = [one.name for one in found.findings]
+    assert sorted(names) == (["sensor-gain"] if "; u[n]" in terms else ["onsite-linear", "sensor-gain"])
+    assert abs(found.declared[1][0] - SOFT) < 0.01
