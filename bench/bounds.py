@@ -11,6 +11,7 @@ import numpy as np
 from latticebench import methods
 from latticebench.bench.limit import Limit, bound_along, denser
 from latticebench.bench.noise import left_by
+from latticebench.bench.report.units import in_words, units_of
 from latticebench.diagnosis.noise import Noise, Structure
 from latticebench.methods.method import solve
 from latticebench.systems.errors import InputError
@@ -62,7 +63,9 @@ def of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> B
         f"{data[0].source}: bound along the motion that {fit.method!r} fits to the samples, with the noise that it "
         "leaves" + ("" if fit.status == "ok" else f" ({fit.status})")
     )
-    return BoundOf(bound_at, "\n".join([note, *(f"noise of {line}" for line in left.lines)]), left.warning)
+    units = in_words(units_of(data[0].origin))
+    lines = [note, *(f"noise of {line}" for line in left.lines), *([f"units: {units}"] if units else [])]
+    return BoundOf(bound_at, "\n".join(lines), left.warning)
 
 
 def covariance_of_fit(data: Sequence[Samples], fit: Fit) -> Float[ndarray, "terms terms"]:

@@ -250,8 +250,7 @@ def cost(table: pd.DataFrame) -> Figure:
             chosen = good[here & (good["method"] == method)]
             axes.plot(
                 np.maximum(chosen["cpu_seconds"], 1e-4), _bounded(chosen["e2"]), MARKERS[k % len(MARKERS)],
-            color=series(k),
-                ms=5, alpha=0.75, label=method,
+                color=series(k), ms=5, alpha=0.75, label=method,
             )  # fmt: skip
         axes.set_xscale("log")
         axes.set_yscale("log")

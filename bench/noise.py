@@ -8,14 +8,16 @@ is correlated from one reading to the next.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.instrument import ROBUST, describe, of_readings, step_of
-from latticebench.diagnosis.noise import Noise, Rows, estimate
+from latticebench.bench.report.units import noise_in_words, units_of
+from latticebench.diagnosis.instrument import ROBUST, of_readings, step_of
+from latticebench.diagnosis.noise import Noise, Rows
+from latticebench.diagnosis.noise_estimate import estimate
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.methods.engine.record import prepare
 from latticebench.systems.samples import Samples, check_alike
@@ -188,13 +190,9 @@ def _is_memory(noise: Noise, left: Channels, level: Channels, rows: Rows) -> boo
     return True
 
 
-def _lines(data: Sequence[Samples], noise: Noise, order: int) -> Iterator[str]:
-    """Yield the noise in words, of u and of v if it was observed."""
+def _lines(data: Sequence[Samples], noise: Noise, order: int) -> list[str]:
+    """Return the noise in words, of u and of v if it was observed."""
     first = data[0]
-    interval = float(np.median(np.diff(first.t)))
-    for level, field in enumerate(fields_of(first, order)):
-        own = slice(level * first.sites, (level + 1) * first.sites)
-        middled = centred(field)
-        steps = [step_of(split_parts(middled[:, k : k + 1], first.is_complex).ravel()) for k in range(first.sites)]
-        part = replace(noise, size=noise.size[own], memory=noise.memory[own])
-        yield from (("velocity, " if level else "") + line for line in describe(part, steps, interval=interval))
+    fields = [centred(one) for one in fields_of(first, order)]
+    steps = [step_of(split_parts(one[:, k], first.is_complex).ravel()) for one in fields for k in range(first.sites)]
+    return noise_in_words(noise, steps, float(np.median(np.diff(first.t))), first.sites, units_of(first.origin))

@@ -11,6 +11,7 @@ import numpy as np
 from latticebench.diagnosis.instrument import of_readings
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.methods.engine.record import prepare, without_halves
+from latticebench.methods.engine.sensitivity import MAX_SUBSTEPS
 from latticebench.methods.engine.shooting import State, maximise
 from latticebench.methods.engine.starts import guess, smooth
 from latticebench.systems.errors import InputError
@@ -125,10 +126,7 @@ def of_fit(data: Sequence[Samples], fit: Fit) -> Overlay:
 
 def _beside(samples: Samples, fit: Fit, number: int) -> Overlay:
     shown = _first(samples)
-    if fit.motion is not None:
-        curve = split_parts(fit.motion[number].u[: len(shown.t)], samples.is_complex)
-    else:
-        curve = _motion(shown, fit)
+    curve = motion_of(shown, fit, number)[:, 0]
     # Not what the fit leaves: a wrong equation would be taken for noise.
     noise = of_readings(samples.t, samples.u)
     known = noise if np.all(np.isfinite(noise)) and np.all(noise > 0) else None
@@ -142,20 +140,41 @@ def _first(samples: Samples) -> Samples:
     return replace(samples, t=samples.t[:rows], u=samples.u[:rows], v=v, f=f)
 
 
-def _motion(samples: Samples, fit: Fit) -> Float[ndarray, "time parts sites"]:
+def motion_of(samples: Samples, fit: Fit, number: int) -> Float[ndarray, "time order parts sites"]:
+    """Return u and, for order 2, v of a fit along the first rows of its recording of that number.
+
+    A method that follows a motion has it. Of any other the equation is taken as it was found, and its start is fitted
+    to the readings; NaN from where it cannot be followed.
+    """
+    if fit.motion is not None:
+        found = fit.motion[number]
+        fields = [found.u] if fit.order == 1 or found.v is None else [found.u, found.v]
+        return np.stack([split_parts(one[: len(samples.t)], samples.is_complex) for one in fields], axis=1)
+    return _nearest(samples, fit)
+
+
+def _nearest(samples: Samples, fit: Fit) -> Float[ndarray, "time order parts sites"]:
     """Return the motion of a fit's equation that is nearest to readings; NaN from where it cannot be followed."""
     with np.errstate(all="ignore"):
         try:
             record = prepare(samples, fit.library.terms, fit.order)
             start = replace(guess([samples], [record]), coefficients=np.asarray(fit.coefficients, dtype=float))
-            found = maximise([record], start, steps=STEPS, tolerance=CLOSE, held=True)
+            stiff = _is_stiff(record, start)
+            found = None if stiff else maximise([record], start, steps=STEPS, tolerance=CLOSE, held=True)
         except (InputError, np.linalg.LinAlgError):
             # There are too few readings for a start, or the equation runs away from every one.
-            return np.full((len(samples.t), 1 + samples.is_complex, samples.sites), np.nan)
-        near = found.state if found.converged else start
-        nodes = near.nodes[0] if found.converged else _followed(record, start)
+            return np.full((len(samples.t), fit.order, 1 + samples.is_complex, samples.sites), np.nan)
+        near = found.state if found is not None and found.converged else start
+        nodes = _followed(record, start) if near is start else near.nodes[0]
         driven = record.stretches.driven(record.times, near.splines[0])
-        return np.asarray(record.stretches.dynamics.whole(nodes, driven)[:, 0])
+        return np.asarray(record.stretches.dynamics.whole(nodes, driven))
+
+
+def _is_stiff(record: Record, state: State) -> bool:
+    """Return whether an equation moves too fast, from one reading to the next, for a start to be fitted."""
+    size = np.nanstd(state.nodes[0], axis=0)
+    needed = record.stretches.substeps(state.coefficients, state.nodes[0][:-1], CLOSE * size, state.splines[0])
+    return bool(np.max(needed) >= MAX_SUBSTEPS)
 
 
 def _followed(record: Record, state: State) -> Float[ndarray, "time state"]:

@@ -26,6 +26,8 @@ MOST_SITES, MOST_SAMPLES = 6, 240
 WIDTH, HEIGHT = 5.6, 3.6
 # Beyond so many times the range of the readings a curve has run away, and is not drawn.
 FAR = 5.0
+# A power below this counts as none.
+LEAST = 1e-290
 
 
 def plot(overlay: Overlay, only: Sequence[str] = (), *, titled: bool = True, figure: Figure | None = None) -> Figure:
@@ -194,10 +196,17 @@ def spectra(part: SubFigure, overlay: Overlay) -> None:
         omega, power, _ = spectrum(overlay.t, (overlay.seen - np.nanmean(overlay.seen, axis=0))[:, None])
         axes.plot(omega, power, color=INK, lw=1.2)
         axes.set_ylabel("power of the readings")
-    if len(omega):
-        axes.set_yscale("log")
+    in_decades(axes)
     axes.set_xlabel(axis("angular frequency", rate_of("rad", overlay.time_unit)))
     axes.grid(alpha=0.25)
+
+
+def in_decades(axes: Axes) -> bool:
+    """Give axes a logarithmic scale upwards if any line on them is above zero; return whether one is."""
+    found = any(np.any(np.asarray(line.get_ydata()) > LEAST) for line in axes.get_lines())
+    if found:
+        axes.set_yscale("log")
+    return found
 
 
 def portraits(part: SubFigure, overlay: Overlay) -> None:

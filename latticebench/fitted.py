@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from threadpoolctl import threadpool_limits
 
 from latticebench import methods
 from latticebench.bench.adequacy import Adequacy, adequacy
@@ -16,8 +17,9 @@ from latticebench.bench.inspection import sine_warning
 from latticebench.bench.overlay import Overlay, of_fit
 from latticebench.bench.report.mathematics import written
 from latticebench.bench.report.rows import html_table
+from latticebench.exhibit import Exhibit
 from latticebench.methods.method import Fit, Skipped, make, solve
-from latticebench.pictures import Film, Picture
+from latticebench.pictures import Picture
 from latticebench.recording import Model, Recording
 from latticebench.systems.errors import InputError
 from latticebench.systems.motion import Motion
@@ -95,7 +97,7 @@ class Residual:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class Fitted(Exhibit):
     """A fit of a model to a recording.
 
     Attributes:
@@ -189,26 +191,12 @@ class Fitted:
     @functools.cached_property
     def residual(self) -> Residual:
         """What the equation leaves of the readings."""
-        return Residual(self._overlay)
+        return Residual(self.overlay)
 
     @functools.cached_property
-    def _overlay(self) -> Overlay:
+    def overlay(self) -> Overlay:
+        """Readings and motion, in the unit of the file (`latticebench.bench.overlay.Overlay`)."""
         return of_fit(self.model.of(self.data), self.result)
-
-    def plot(self, *only: str) -> Picture:
-        """Draw the readings, the motion of the equation that is nearest to them, and what it leaves.
-
-        Args:
-            only: names of panels: map, sites, residual, spectrum, phase; all that tell something if there are none.
-
-        Raises:
-            InputError: there is no such panel.
-        """
-        return Picture(self._overlay, only)
-
-    def animate(self) -> Film:
-        """Return a film of the readings with the motion of the equation, which a notebook shows and `save` writes."""
-        return Film(self._overlay)
 
     def simulate(
         self, u: ArrayLike | None = None, v: ArrayLike | None = None, *, t: ArrayLike | None = None
@@ -290,7 +278,9 @@ def fit(data: Recording, model: Model, method: str = "trajectory", seed: int = 1
     """
     samples, terms = model.of(data), model.library
     try:
-        result = solve(make(methods.find(method), settings), samples, terms, model.order, seed)
+        # On matrices of these sizes more threads are slower, up to forty times beside other work.
+        with threadpool_limits(1, user_api="blas"):
+            result = solve(make(methods.find(method), settings), samples, terms, model.order, seed)
     except Skipped as reason:
         raise InputError(f"method {method!r} cannot fit {samples[0].source}: {reason}; choose another") from None
     return Fitted(result, adequacy(samples, result).also(sine_warning(samples, terms)), model, data)

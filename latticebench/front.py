@@ -14,17 +14,19 @@ from __future__ import annotations
 
 import functools
 import html
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
+from threadpoolctl import threadpool_limits
 
 from latticebench.bench.overlay import of_diagnosis
 from latticebench.bench.report.rows import html_table
+from latticebench.exhibit import Exhibit
 from latticebench.methods.method import Skipped
-from latticebench.pictures import Film, Picture
 from latticebench.recording import Model, Recording
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Cause:
+class Cause(Exhibit):
     """A diagnosis: what an equation lacks of a recording.
 
     Attributes:
@@ -113,23 +115,9 @@ class Cause:
         return page(self.report, curves(self.result))
 
     @functools.cached_property
-    def _overlay(self) -> Overlay:
+    def overlay(self) -> Overlay:
+        """Readings and what both equations make of them (`latticebench.bench.overlay.Overlay`)."""
         return of_diagnosis(self.result)
-
-    def plot(self, *only: str) -> Picture:
-        """Draw the readings, what both equations make of them, and what they leave.
-
-        Args:
-            only: names of panels: map, sites, residual, spectrum, phase; all that tell something if there are none.
-
-        Raises:
-            InputError: there is no such panel.
-        """
-        return Picture(self._overlay, only)
-
-    def animate(self) -> Film:
-        """Return a film of the readings with both motions, which a notebook shows and `save` writes."""
-        return Film(self._overlay)
 
     def save(self, path: str | Path) -> Path:
         """Write the page, whole or not at all."""
@@ -230,7 +218,8 @@ def limit(data: Recording, model: Model, target: float = 0.01) -> Bound:
 
     samples = model.of(data)
     try:
-        found = of_recordings(samples, model.library, model.order)
+        with threadpool_limits(1, user_api="blas"):
+            found = of_recordings(samples, model.library, model.order)
     except Skipped as reason:
         raise InputError(f"{samples[0].source}: {reason}") from None
     return Bound(found.at(1, 1), design(found.at, target=target), tuple(found.note.splitlines()), tuple(found.warnings))
@@ -255,7 +244,7 @@ def results(name: str | Path) -> Mapping[str, pd.DataFrame]:
     """
     from latticebench.bench.published import folder_of, read_table
 
-    folder = Path(name) if Path(name).is_dir() else folder_of(str(name))
+    folder = Path(name) if os.path.isdir(name) else folder_of(str(name))
     paths = sorted(folder.glob("*.csv"))
     if not paths:
         raise InputError(

@@ -4,6 +4,7 @@ import doctest
 import inspect
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ import pytest
 import latticebench as lb
 from latticebench import fitted, front, pictures, recording
 from latticebench.systems.errors import InputError
+from latticebench.systems.simulate import simulate
 
 MODULES = (recording, fitted, front, pictures)
 PENDULUM = lb.Model("sin(u[n])", order=2, ends="free")
@@ -183,6 +185,20 @@ def test_a_fit_of_degrees_warns_before_anything_else_and_names_a_remedy():
     assert repr(found).startswith("Warning: the equation does not fit")
     assert any("--scale deg" in line for line in found.warnings)
     assert "<b>Warning:</b>" in found._repr_html_()
+
+
+@pytest.mark.parametrize("damping", [0, 1e-3])
+def test_readings_without_noise_do_not_contradict_themselves(damping):
+    known = lb.systems.find("sine-gordon")
+    moved = replace(known, equation=f"{known.equation} - {damping}*v[n]")
+    samples = simulate(moved, parameters={"C": 0.5, "v": 0.5}, sites=21)
+    cause = lb.diagnose(lb.Recording((samples,)), lb.system("sine-gordon"))
+    assert cause.verdict == ("explained" if damping else "nothing missing")
+    assert set(cause.effects["effect"]) == ({"damping"} if damping else set())
+    assert cause.result.left == ()
+    assert not any(one.indistinguishable for one in cause.report.effects)
+    assert cause.result.residual[1] < 1
+    assert all("at most" in line for line in cause.report.noise_lines)
 
 
 def test_a_bound_and_a_diagnosis_are_objects_with_tables():

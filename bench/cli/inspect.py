@@ -129,8 +129,10 @@ def _draw(samples: Samples, out: Path) -> None:
     import numpy as np
     from matplotlib.figure import Figure
 
+    from latticebench.bench.colours import INK
     from latticebench.bench.escape import label
     from latticebench.bench.figures import save
+    from latticebench.bench.plots import in_decades
     from latticebench.bench.provenance import command_line
     from latticebench.bench.report.units import axis, with_unit
     from latticebench.diagnosis.problem import Spectrum
@@ -142,7 +144,7 @@ def _draw(samples: Samples, out: Path) -> None:
     readings, lines = figure.subplots(1, 2, width_ratios=(2, 1))
     middle = np.nanmean(values, axis=0)
     spacing = 1.1 * float(np.nanmax(np.abs(values - middle))) or 1.0
-    readings.plot(samples.t, values - middle + spacing * np.arange(samples.sites), linewidth=0.8)
+    readings.plot(samples.t, values - middle + spacing * np.arange(samples.sites), color=INK, linewidth=0.8)
     names = [label(one) for one in origin.columns] or [f"u{site + 1}" for site in range(samples.sites)]
     every = max(1, samples.sites // 20)
     readings.set_yticks(spacing * np.arange(samples.sites)[::every], names[::every])
@@ -150,9 +152,10 @@ def _draw(samples: Samples, out: Path) -> None:
     apart = label(with_unit(f"{spacing:.2g}", origin.unit))
     readings.set_title(f"readings about their means; {apart} from one to the next")
     spectrum = Spectrum.of(samples)
-    lines.semilogy(spectrum.omega / (2 * np.pi), spectrum.power + np.finfo(float).tiny, linewidth=0.8)
-    top = float(np.max(spectrum.power))
-    lines.set_ylim(1e-8 * top, 2 * top)
+    lines.plot(spectrum.omega / (2 * np.pi), spectrum.power, color=INK, linewidth=0.8)
+    if in_decades(lines):
+        top = float(np.max(spectrum.power))
+        lines.set_ylim(1e-8 * top, 2 * top)
     lines.set_xlabel(f"cycles per {label(origin.time) or 'unit of time'}")
     lines.set_title("mean power spectrum")
     save(figure, out, {"command": command_line()})

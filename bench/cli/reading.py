@@ -17,7 +17,12 @@ if TYPE_CHECKING:
     from latticebench.systems.samples import Samples
 
 PANEL = "How the recording lies in its file"
-Files = Annotated[list[Path], typer.Argument(help="One or more .csv, .txt, .tsv, .dat, .xlsx, .parquet or .npz files.")]
+Files = Annotated[
+    list[Path],
+    typer.Argument(
+        help="One or more .csv, .txt, .tsv, .dat, .xlsx, .parquet or .npz files, or folders of such, or .zarr."
+    ),
+]
 Time = Annotated[
     str | None,
     typer.Option(

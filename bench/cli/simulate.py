@@ -20,7 +20,9 @@ EPILOG = (
 
 def simulate(
     system: SystemName,
-    out: Annotated[Path, typer.Option(parser=place, metavar="FILE", help="The file to write: .csv, .npz or .parquet.")],
+    out: Annotated[
+        Path, typer.Option(parser=place, metavar="FILE", help="The file to write: .csv, .npz, .parquet, or .zarr.")
+    ],
     given: Settings = None,
     sites: Annotated[int | None, typer.Option(help="Number of sites N.")] = None,
     samples: Annotated[int, typer.Option(help="Number of sample times.")] = 50,
@@ -39,20 +41,24 @@ def simulate(
         typer.Option(help="The system's own (the paper's) if not given; of more than 1000 sites dop853."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of noise, gaps and uneven times.")] = 1,
+    parts: Annotated[
+        bool, typer.Option("--parts", help="Write a .parquet folder, with a file for each trajectory.")
+    ] = False,
     yes: Yes = False,
 ) -> None:
     """Simulate a system and write samples of it."""
     from latticebench import systems
     from latticebench.bench.effort import check_size
     from latticebench.bench.fitting import samples as make_samples
+    from latticebench.systems.folders import ZARR
     from latticebench.systems.readers import FORMATS
     from latticebench.systems.simulate import drift
     from latticebench.systems.writers import write
 
     check_places([system], out=out)
     found = systems.find(system)
-    if out.suffix.lower() not in FORMATS:
-        raise unknown("ending", out.suffix, FORMATS, str(out))
+    if out.suffix.lower() not in (*FORMATS, ZARR):
+        raise unknown("ending", out.suffix, (*FORMATS, ZARR), str(out))
     case = case_of(
         system=system, parameters=numbers(given), sites=sites, samples=samples, span=span, uneven=uneven, noise=noise,
         missing=missing, trajectories=trajectories, velocities=velocities, ends=ends, initial=initial,
@@ -61,7 +67,7 @@ def simulate(
     if not yes:
         check_size(case, case.sites or found.sites, system)
     data = make_samples(case, Path())
-    write([one.observed() for one in data], out)
+    write([one.observed() for one in data], out, parts=parts)
     listed = ", ".join(f"{name}={value:g}" for name, value in found.with_parameters(case.parameters).items())
     drifts = [drift(found, case.parameters, one.exact, case.ends) for one in data if one.exact is not None]
     kept = [one for one in drifts if one is not None]

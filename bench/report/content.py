@@ -217,12 +217,14 @@ def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
         said.append(
             f"Something without a name, {best.name}{where}, does better in the place of {_listed(best.instead)}."
         )
+    lost = diagnosis.residual[1] > rules.LOST
     if len(rivals) < len(diagnosis.left):
-        said.append("Something more is left that nothing in the catalogue explains.")
+        size = "" if lost else f"; in all, the model leaves {diagnosis.residual[1]:.3g} times the noise"
+        said.append(f"Something more is left that nothing in the catalogue explains{size}.")
     elif not rivals:
         them = "it" if len(names) == 1 else "them"
         said.append(f"With {them}, nothing significant is left.")
-    if diagnosis.residual[1] > rules.LOST:
+    if lost:
         said.append(f"The model does not reach the readings: it leaves {diagnosis.residual[1]:.2g} times their noise.")
     return " ".join(said)
 

@@ -371,7 +371,7 @@ def fit_document(
         provenance=about, method=found.method, order=found.order,
         coefficients=dict(zip(texts, map(float, found.coefficients), strict=True)),
         stderr=None if found.stderr is None else dict(zip(texts, map(float, found.stderr), strict=True)),
-        residual=found.residual, seconds=found.seconds, status=found.status,
+        residual=found.residual, seconds=found.seconds, status=quality.state(found.status),
         quality=Quality(work=quality.work, r2=quality.r2, times=quality.times, fits=quality.fits),
         warnings=list(quality.warnings), units=units,
         shown=None if overlay is None else Shown.of(overlay),

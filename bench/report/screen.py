@@ -79,7 +79,7 @@ def show_fit(fit: Fit, quality: Adequacy | None = None, units: str = "") -> None
         else f"; {100 * fit.residual:.3g} % of {'the readings' if fit.motion else 'the derivative'} is left, "
         "its noise included"
     )
-    state = fit.status if quality is None or quality.fits or fit.status != "ok" else "does not fit"
+    state = fit.status if quality is None else quality.state(fit.status)
     lines = [written(fit), f"{fit.method}: {state}{left}; {fit.seconds:.2f} s"]
     if units:
         lines.append(f"units: {units}")

@@ -116,7 +116,7 @@ def _recording(result: Mapping[str, Any]) -> list[str]:
     text = [f"## {case['name']}", "", f"`{case['file']}`{rows}. Declared: {declared}.", ""]
     if report is None:
         return [*text, f"{result['status']}: {result['reason']}", ""]
-    text += [f"Verdict: **{report['verdict']}**, {result['seconds']:.0f} s.", ""]
+    text += [f"Verdict: **{report['verdict']}**, {result['seconds']:.0f} s. {report['sentence']}", ""]
     for effect in report["effects"]:
         values = ", ".join(
             f"{name} {format_number(value)}"

@@ -1,5 +1,6 @@
 """A fit that does not describe the readings says so, and one that does is left in peace; none looks at the truth."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +8,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench import methods
+from latticebench.bench import adequacy as judge
 from latticebench.bench.adequacy import adequacy
 from latticebench.bench.fitting import FitCase, samples
 from latticebench.methods.method import Fit, make, solve
 from latticebench.systems import find
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import observe, sample_times, simulate
 
 PENDULA = library("pendula", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])")
 
@@ -95,3 +98,33 @@ def test_a_motion_that_runs_away_and_a_sensor_that_rests_are_no_obstacle():
     quality = adequacy([rests], Fit("any", PENDULA, 2, np.array([1.0, 500.0]), 0.0))
     assert not quality.fits
     assert np.isfinite(quality.work)
+
+
+def long_chain():
+    clean = simulate(find("phi4"), sites=60, times=sample_times(40, 4.0), variation=np.random.default_rng(4))
+    return replace(observe(clean, np.random.default_rng(1), noise=0.01).observed(), ends="free")
+
+
+def test_a_long_chain_is_judged_by_windows_that_a_seed_chooses(monkeypatch):
+    seen, terms = long_chain(), find("phi4").library("lib2")
+    right = solve(make(methods.find("least-squares"), {}), [seen], terms, 2, 1)
+    wrong = replace(right, coefficients=right.coefficients * [1, 1, 1, 0.3])
+    whole = adequacy([seen], right)
+    followed, smooth = [], judge.smooth
+    monkeypatch.setattr(judge, "WIDE", 40)
+    monkeypatch.setattr(judge, "WINDOW", 20)
+    monkeypatch.setattr(judge, "smooth", lambda one, order: followed.append(one.sites) or smooth(one, order))
+    found = adequacy([seen], right)
+    assert followed == [22] * judge.PLACES
+    assert found == adequacy([seen], right)
+    assert found.fits
+    assert found.r2 == pytest.approx(whole.r2, abs=0.02)
+    assert not adequacy([seen], wrong).fits
+
+
+def test_a_motion_is_judged_where_the_windows_are(monkeypatch):
+    seen = long_chain()
+    fit = solve(make(methods.find("trajectory"), {}), [seen], find("phi4").library("lib2"), 2, 1)
+    monkeypatch.setattr(judge, "WIDE", 40)
+    monkeypatch.setattr(judge, "WINDOW", 20)
+    assert 0.8 < adequacy([seen], fit).times < 1.2

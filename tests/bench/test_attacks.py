@@ -5,7 +5,6 @@ The seeds of the quick suite are few; the slow tests take more of them.
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import random
@@ -15,14 +14,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import pytest
 
-from latticebench.bench.cli import main
+from commandline import FIT, SOON, latticebench, refused, soon
 from latticebench.bench.store import FILE
 from latticebench.bench.suite import load
 from latticebench.systems.errors import InputError
@@ -30,9 +28,7 @@ from latticebench.systems.errors import InputError
 # A figure of damaged numbers may be told to have an odd layout.
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::RuntimeWarning")
 posix = pytest.mark.skipif(os.name != "posix", reason="pipes and devices as POSIX has them")
-# Processor seconds after which a refusal counts as a hang.
-SOON = 20.0
-SUITE = """
+MARKUP = """
 title = "{title}"
 [methods."{label}"]
 method = "zero"
@@ -51,36 +47,11 @@ noise = [0.0, 0.01]
 ODD = ("null", "[]", "{}", "5", '"x"', "true", "{", "", "[" * 100_000, "1" * 10_000, '{"a": {"b": [1, null, "c"]}}')
 
 
-def latticebench(*arguments: object, cwd: Path) -> tuple[int, str, str]:
-    """Run a command within this process; an error that is not told in one line fails the test."""
-    out, err, before, began = io.StringIO(), io.StringIO(), Path.cwd(), time.process_time()
-    os.chdir(cwd)
-    try:
-        with (
-            mock.patch.object(sys, "argv", ["latticebench", *map(str, arguments)]), redirect_stdout(out),
-            redirect_stderr(err), mock.patch.dict(os.environ), pytest.raises(SystemExit) as end,
-        ):  # fmt: skip
-            main()
-    finally:
-        os.chdir(before)
-    assert time.process_time() - began < SOON
-    return int(end.value.code or 0), out.getvalue(), err.getvalue()
-
-
-def refused(*arguments: object, cwd: Path) -> str:
-    """Return the one line in which a command is refused."""
-    code, _, err = latticebench(*arguments, cwd=cwd)
-    assert code == 2, (arguments, err)
-    assert err.startswith("error: ")
-    assert err.count("\n") == 1, err
-    return err
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a suite whose names are markup, its results, and samples."""
     folder = tmp_path_factory.mktemp("made")
-    text = SUITE.format(title="[/x] <b> \\\\input", label="=$\\\\input{{x}}$ [/x] <script>|_ ](x)")
+    text = MARKUP.format(title="[/x] <b> \\\\input", label="=$\\\\input{{x}}$ [/x] <script>|_ ](x)")
     (folder / "s.toml").write_text(text.replace("{{", "{").replace("}}", "}"))
     assert latticebench("run", "s.toml", "--jobs", 1, "--results", "store", cwd=folder)[0] == 0
     assert latticebench("simulate", "phi4", "--sites", 5, "--samples", 12, "--out", "t.csv", cwd=folder)[0] == 0
@@ -161,7 +132,7 @@ def survive_damage(made: Path, folder: Path, seeds: range) -> None:
             ["table", store, "--out", folder / "out"], ["table", store, "--json"],
             ["figures", store, "--out", folder / "out"], ["compare", store, made / "store"],
         ):  # fmt: skip
-            code, _, err = latticebench(*command, cwd=folder)
+            code, _, err = soon(*command, cwd=folder)
             assert code in (0, 1, 2), (seed, command)
             assert code != 2 or (err.startswith("error: ") and err.count("\n") == 1), (seed, command, err)
 
@@ -206,14 +177,11 @@ def survive_data(made: Path, folder: Path, seeds: range) -> None:
             shutil.copy(folder / name, damaged)
             data_damaged(damaged, random.Random(seed))
             before = damaged.read_bytes()
-            code, _, err = latticebench("fit", damaged, *FIT, cwd=folder)
+            code, _, err = soon("fit", damaged, *FIT, cwd=folder)
             assert code in (0, 2), (seed, ending)
             assert code == 0 or (err.startswith("error: ") and err.count("\n") == 1), (seed, ending, err)
             assert damaged.read_bytes() == before
             damaged.unlink()
-
-
-FIT = ("--terms", "u[n]; u[n]**3", "--order", 2, "--ends", "free", "--method", "least-squares")
 
 
 def test_damaged_data_are_fitted_or_refused_in_one_line(made: Path, tmp_path: Path) -> None:

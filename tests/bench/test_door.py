@@ -106,6 +106,16 @@ def test_a_fit_of_degrees_warns_in_its_first_line_and_in_json(typed: Typed) -> N
     assert found["units"] == {"time": "s", "reading": "deg", "equation": "deg", "scale": 1}
 
 
+def test_a_bound_warns_of_a_misfit_first_and_says_the_noise_in_degrees(typed: Typed) -> None:
+    shown, _ = typed("limit", "pendula.csv", *READING, *MODEL)
+    assert shown.startswith("Warning: the equation leaves")
+    sizes = re.findall(r"noise of sensor \d: (\S+) deg", shown)
+    assert len(sizes) == 7
+    # What the defect and the offsets leave; in radians it would be a sixtieth of that.
+    assert all(0.3 < float(size) < 20 for size in sizes)
+    assert "units: t in s; u in rad; readings in deg" in shown
+
+
 @pytest.mark.slow
 def test_offsets_and_damping_are_named_in_degrees_from_the_unedited_file(typed: Typed, tmp_path: Path) -> None:
     shown, _ = typed("diagnose", "pendula.csv", *READING, *MODEL, "--json", "d.json")

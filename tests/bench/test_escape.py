@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -70,7 +71,8 @@ def test_what_a_suite_says_of_a_recording_is_text_in_its_page(tmp_path: Path) ->
     case = {"name": "one", "about": evil, "file": evil, "terms": "u[n]", "order": 2, "ends": evil, "rows": None}
     error = {name: {"before": "<b>", "after": 0.5} for name in ("residual", "rms", "forecast")}
     effect = {"effect": evil, "parameters": {evil: evil}, "coefficients": {}, "indistinguishable": [evil]}
-    report = {"verdict": evil, "effects": [effect], "noise_lines": [evil], "error": error, "horizons": []}
+    report = {"verdict": evil, "sentence": evil, "effects": [effect], "noise_lines": [evil], "error": error}
+    report["horizons"] = []
     told = [
         {"case": case, "status": "ok", "reason": "", "report": report, "seconds": 1.0},
         {"case": case, "status": "failed", "reason": evil, "report": None, "seconds": None},

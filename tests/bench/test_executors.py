@@ -6,13 +6,12 @@ import importlib.util
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from commandline import refused, succeed
 from latticebench.bench.case import Folders
-from latticebench.bench.cli import main
 from latticebench.bench.executors.batches import LONGEST, LOSSES, SHARE, Batches
 from latticebench.bench.executors.cluster import is_open, place_of, read_jobs
 from latticebench.bench.executors.parcel import Shelf, contents, moved, named_as_sent, pack
@@ -22,23 +21,6 @@ from latticebench.bench.presence import Presence, running
 from latticebench.bench.source import fingerprint
 from latticebench.bench.store import create
 from latticebench.systems.errors import InputError
-
-Typed = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def typed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Typed:
-    """Run a command; return its exit code and what it prints."""
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["latticebench", *arguments])
-        with pytest.raises(SystemExit) as end:
-            main()
-        out, err = capsys.readouterr()
-        assert isinstance(end.value.code, int)
-        return end.value.code, out, err
-
-    return run
 
 
 def case(seed: int = 1, label: str = "a", method: str = "zero", system: str = "phi4") -> FitCase:
@@ -185,21 +167,17 @@ def test_a_scheduler_that_others_may_reach_without_tls_is_known() -> None:
         (["--scheduler", "tcp://a:1"], "goes with --executor dask"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(typed: Typed, options: list[str], told: str) -> None:
-    code, _, err = typed("run", "tiny", "--dry-run", *options)
-    assert code == 2
-    assert told in err
+def test_options_that_do_not_go_together_are_refused(options: list[str], told: str, tmp_path: Path) -> None:
+    assert told in refused("run", "tiny", "--dry-run", *options, cwd=tmp_path)
 
 
 def test_without_dask_its_executor_is_refused_with_what_to_install(
-    typed: Typed, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "distributed" else found(name))
-    code, _, err = typed("run", "tiny", "--executor", "dask", "--cluster", "local:1")
-    assert code == 2
-    assert "pip install 'latticebench[cluster]'" in err
-    assert len(err.splitlines()) == 1
+    line = refused("run", "tiny", "--executor", "dask", "--cluster", "local:1", cwd=tmp_path)
+    assert "pip install 'latticebench[cluster]'" in line
 
 
 def test_the_local_runner_loads_nothing_of_dask() -> None:
@@ -212,7 +190,7 @@ def test_the_local_runner_loads_nothing_of_dask() -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_status_says_what_is_done_what_runs_where_and_what_went_wrong(typed: Typed, tmp_path: Path) -> None:
+def test_status_says_what_is_done_what_runs_where_and_what_went_wrong(tmp_path: Path) -> None:
     store = create(tmp_path / "store")
     one, two = case(1), case(2)
     store.plan({one.identity: "k1", two.identity: "k2", case(3).identity: "k3"}, {})
@@ -227,15 +205,13 @@ def test_status_says_what_is_done_what_runs_where_and_what_went_wrong(typed: Typ
     (run,) = running(store)
     assert (run.left, run.done) == (3, 1)
     assert run.remaining == pytest.approx(2 * run.seconds)
-    code, out, _ = typed("status", str(tmp_path / "store"))
-    assert code == 0
+    out = succeed("status", "store", cwd=tmp_path)
     assert "1 of 3 cases are done (1 failed)" in out
     assert f"{two.title} | on tcp://node7:1234 for 0:00:0" in out
     assert f"failed: {one.title}: no luck" in out
     assert re.search(r"1 of 3, (1|0\.\d+) a minute, about 0:0\d:\d\d left", out)
     assert out.count("tcp://node7") == 1
     presence.leave()
-    _, out, _ = typed("status", str(tmp_path / "store"))
+    out = succeed("status", "store", cwd=tmp_path)
     assert "no run is on it now; the command that began it continues it" in out
-    code, _, err = typed("status", str(tmp_path / "nowhere"))
-    assert (code, "not a store of results" in err) == (2, True)
+    assert "not a store of results" in refused("status", "nowhere", cwd=tmp_path)

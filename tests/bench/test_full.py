@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import gc
-import io
-import os
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
 import pytest
 
-from latticebench.bench.cli import main
+from commandline import EQUATION, FIT, SUITE, content, latticebench
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import write_text
 
@@ -21,23 +18,11 @@ from latticebench.systems.files import write_text
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 resource = pytest.importorskip("resource", reason="limits files as POSIX systems do")
 
-FIT = ("--terms", "u[n]; u[n]**3", "--order", "2", "--ends", "free")
-SUITE = """
-[methods.a]
-method = "least-squares"
-[[grid]]
-system = "phi4"
-sites = 5
-samples = 8
-span = 1.0
-libraries = ["lib1"]
-noise = [0.0, 0.01]
-"""
 # The command, the file or folder that it writes, and what the screen has all the same.
 COMMANDS = {
-    "fit": (["fit", "t.csv", *FIT, "--method", "least-squares", "--json", "r.json"], "r.json", "u'' ="),
+    "fit": (["fit", "t.csv", *FIT, "--json", "r.json"], "r.json", "u'' ="),
     "limit": (["limit", "--system", "phi4", "--library", "lib1", "--json", "r.json"], "r.json", "bound"),
-    "diagnose": (["diagnose", "t.csv", *FIT, "--json", "r/r.json", "--html", "r/r.html"], "r", "What the equation"),
+    "diagnose": (["diagnose", "t.csv", *EQUATION, "--json", "r/r.json", "--html", "r/r.html"], "r", "What the eq"),
     "simulate csv": (["simulate", "phi4", "--sites", "5", "--out", "r.csv"], "r.csv", ""),
     "simulate npz": (["simulate", "phi4", "--sites", "5", "--out", "r.npz"], "r.npz", ""),
     "simulate parquet": (["simulate", "phi4", "--sites", "5", "--out", "r.parquet"], "r.parquet", ""),
@@ -45,21 +30,6 @@ COMMANDS = {
     "figures": (["figures", "store", "--out", "r"], "r", ""),
     "schema": (["schema", "--out", "r"], "r", ""),
 }  # fmt: skip
-
-
-def latticebench(folder: Path, *arguments: str) -> tuple[int, str, str]:
-    """Run a command within this process; return its exit code, what it prints, and what it complains of."""
-    out, err, before = io.StringIO(), io.StringIO(), Path.cwd()
-    os.chdir(folder)
-    try:
-        with (
-            mock.patch.object(sys, "argv", ["latticebench", *arguments]), redirect_stdout(out), redirect_stderr(err),
-            mock.patch.dict(os.environ), pytest.raises(SystemExit) as end,
-        ):  # fmt: skip
-            main()
-    finally:
-        os.chdir(before)
-    return int(end.value.code or 0), out.getvalue(), err.getvalue()
 
 
 @contextmanager
@@ -73,10 +43,9 @@ def room_for(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def content(folder: Path) -> dict[str, bytes]:
+def besides_store(folder: Path) -> dict[str, bytes]:
     """Return what is in a folder, but for the store, which SQLite looks after."""
-    files = (path for path in folder.rglob("*") if path.is_file() and path.parent.name != "store")
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+    return {path: text for path, text in content(folder).items() if not path.startswith("store/")}
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +53,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with samples and a store."""
     folder = tmp_path_factory.mktemp("made")
     (folder / "s.toml").write_text(SUITE)
-    assert latticebench(folder, "simulate", "phi4", "--sites", "5", "--samples", "12", "--out", "t.csv")[0] == 0
-    assert latticebench(folder, "run", "s.toml", "--jobs", "1", "--results", "store")[0] == 0
+    assert latticebench("simulate", "phi4", "--sites", "5", "--samples", "12", "--out", "t.csv", cwd=folder)[0] == 0
+    assert latticebench("run", "s.toml", "--jobs", "1", "--results", "store", cwd=folder)[0] == 0
     # Closes the store, as the end of a process does.
     gc.collect()
     return folder
@@ -93,15 +62,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def survive(made: Path, name: str, sizes: tuple[int, ...]) -> None:
     arguments, place, shown = COMMANDS[name]
-    known = content(made)
+    known = besides_store(made)
     for size in sizes:
         with room_for(size):
-            code, out, err = latticebench(made, *arguments)
+            code, out, err = latticebench(*arguments, cwd=made)
         told = (name, size, code, err)
         assert code in (0, 2), told
         assert code == 0 or (err.startswith("error: ") and err.count("\n") == 1), told
         assert shown in out or "store cannot be read now" in err.replace("/results.sqlite:", ""), told
-        now = content(made)
+        now = besides_store(made)
         new = {path: text for path, text in now.items() if known.get(path) != text}
         # What is there is whole: nothing ends where the room did, and nothing temporary is left.
         assert all(len(text) > 0 and (len(text) < size or code == 0) for text in new.values()), told
@@ -126,7 +95,7 @@ def test_an_output_on_a_disk_that_is_full_at_many_points_is_whole_or_not_there(n
     ("arguments", "left", "shown"),
     [
         (
-            ["fit", "t.csv", *FIT, "--method", "least-squares", "--json", "r.json", "--html", "r.html"],
+            ["fit", "t.csv", *FIT, "--json", "r.json", "--html", "r.html"],
             "r.html",
             "u'' =",
         ),
@@ -144,7 +113,7 @@ def test_where_one_place_fails_the_other_output_is_written_and_the_screen_has_it
         write_text(path, text)
 
     with mock.patch("latticebench.systems.files.write_text", failing):
-        code, out, err = latticebench(made, *arguments)
+        code, out, err = latticebench(*arguments, cwd=made)
     assert (code, err) == (2, f"error: {told}\n")
     assert shown in out
     assert (made / left).stat().st_size > 0

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from latticebench.bench.cli import main
+from commandline import succeed
 from latticebench.bench.provenance import origin
 from latticebench.bench.source import keys
 from latticebench.bench.store import create
@@ -70,28 +70,17 @@ def measured(*arguments: str, cwd: Path) -> tuple[str, float, float]:
 posix = pytest.mark.skipif(os.name != "posix", reason="measures as POSIX systems do")
 
 
-def test_a_run_of_a_thousand_finished_cases_has_nothing_to_do_and_is_tabled(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def typed(*arguments: str) -> str:
-        monkeypatch.setattr(sys, "argv", ["latticebench", *arguments])
-        with pytest.raises(SystemExit) as end:
-            main()
-        assert not end.value.code
-        return capsys.readouterr().out
-
+def test_a_run_of_a_thousand_finished_cases_has_nothing_to_do_and_is_tabled(tmp_path: Path) -> None:
     filled(tmp_path, 120)
-    monkeypatch.chdir(tmp_path)
-    out = typed("run", "many.toml", "--results", "store")
+    out = succeed("run", "many.toml", "--results", "store", cwd=tmp_path)
     assert "1200 cases (1200 ok); 0 run now, 1200 were there" in out
     assert "seeds: 1-120" in out
-    assert "30 cases (30 ok); 0 run now, 30 were there" in typed(
-        "run", "many.toml", "--results", "store", "--shard", "3/40"
-    )
+    part = succeed("run", "many.toml", "--results", "store", "--shard", "3/40", cwd=tmp_path)
+    assert "30 cases (30 ok); 0 run now, 30 were there" in part
     suite = tmp_path / "many.toml"
     suite.write_text(suite.read_text().replace("methods.floor", "methods.ground"))
-    assert "0 run now, 1200 were there" in typed("run", "many.toml", "--results", "store")
-    typed("table", "store", "--out", "out")
+    assert "0 run now, 1200 were there" in succeed("run", "many.toml", "--results", "store", cwd=tmp_path)
+    succeed("table", "store", "--out", "out", cwd=tmp_path)
     rows = [line for line in (tmp_path / "out" / "cases.csv").read_text().splitlines() if not line.startswith("#")]
     assert len(rows) == 1201
     assert all(",ground," in row for row in rows[1:])

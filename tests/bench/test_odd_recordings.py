@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-import io
-import os
 import re
-import signal
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from types import FrameType
-from unittest import mock
 
 import numpy as np
 import pytest
 
-from latticebench.bench.cli import main
+from commandline import soon
 from latticebench.systems.samples import Samples
 from latticebench.systems.writers import write
 
-# Processor seconds after which a diagnosis of so few readings counts as a hang.
-SOON = 20.0
 TERMS = (
     "u[n]", "u[n]**3", "u[n]**2", "1", "u[n+1]", "u[n+1]-u[n-1]", "u[n+1]+u[n-1]-2*u[n]", "v[n]", "sign(v[n])",
     "abs(v[n])*v[n]", "sin(u[n])", "cos(t)", "t*u[n]", "n*u[n]", "exp(u[n])", "u[n]**15", "u[n]+1e-12*u[n]**2", "f[n]",
@@ -62,7 +52,7 @@ def rounded(draw: np.random.Generator, u: np.ndarray) -> None:
 
 
 def wild_row(draw: np.random.Generator, u: np.ndarray) -> None:
-    u[draw.integers(len(u))] = draw.choice([1e8, -1e20])
+    u[draw.integers(len(u))] = draw.choice([1e8, -1e19])
 
 
 def still(draw: np.random.Generator, u: np.ndarray) -> None:
@@ -122,45 +112,10 @@ def odd(seed: int, folder: Path) -> list[str]:
     return ["diagnose", *files, "--terms", terms, "--order", str(order), "--ends", ends, *outputs]
 
 
-class Hang(BaseException):
-    """A command takes longer than it may."""
-
-
-@contextmanager
-def no_longer_than(seconds: float) -> Iterator[None]:
-    """Raise Hang in what takes more processor time."""
-
-    def late(_number: int, _frame: FrameType | None) -> None:
-        raise Hang
-
-    before = signal.signal(signal.SIGVTALRM, late)
-    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-        signal.signal(signal.SIGVTALRM, before)
-
-
-def diagnosed(arguments: list[str], folder: Path) -> tuple[int, str, str]:
-    """Run a command within this process; return its exit code, what it prints, and what it complains of."""
-    out, err, before = io.StringIO(), io.StringIO(), Path.cwd()
-    os.chdir(folder)
-    try:
-        with (
-            mock.patch.object(sys, "argv", ["latticebench", *arguments]), redirect_stdout(out), redirect_stderr(err),
-            mock.patch.dict(os.environ), pytest.raises(SystemExit) as end, no_longer_than(SOON),
-        ):  # fmt: skip
-            main()
-    finally:
-        os.chdir(before)
-    return int(end.value.code or 0), out.getvalue(), err.getvalue()
-
-
 def survive(folder: Path, seeds: range) -> None:
     for seed in seeds:
         arguments = odd(seed, folder)
-        code, out, err = diagnosed(arguments, folder)
+        code, out, err = soon(*arguments, cwd=folder)
         told = (seed, arguments, err)
         assert code in (0, 2), told
         # A failure that is told is one all the same.
@@ -170,12 +125,10 @@ def survive(folder: Path, seeds: range) -> None:
         assert bool(out) == (code == 0), told
 
 
-@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="measures as POSIX systems do")
 def test_an_odd_recording_is_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path) -> None:
     survive(tmp_path, range(12))
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="measures as POSIX systems do")
 def test_many_odd_recordings_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path) -> None:
     survive(tmp_path, range(1000, 1300))

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import json
-import os
 import random
 import re
 import shutil
 import sqlite3
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
 
-from latticebench.bench.cli import main
+from commandline import SUITE, latticebench, refused, unchanged
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.leases import Leases
 from latticebench.bench.published import read_table
@@ -29,43 +23,6 @@ from latticebench.systems.errors import InputError
 
 # A figure of damaged numbers may be told to have an odd layout.
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::RuntimeWarning")
-SUITE = """
-[methods.zero]
-method = "zero"
-[methods.other]
-method = "least-squares"
-[[grid]]
-system = "phi4"
-sites = 5
-samples = 8
-span = 1.0
-libraries = ["lib1"]
-noise = [0.0, 0.01]
-"""
-
-
-def latticebench(folder: Path, *arguments: object) -> tuple[int, str, str]:
-    """Run a command within this process; return its exit code, what it prints, and what it complains of."""
-    out, err, before = io.StringIO(), io.StringIO(), Path.cwd()
-    os.chdir(folder)
-    try:
-        with (
-            mock.patch.object(sys, "argv", ["latticebench", *map(str, arguments)]), redirect_stdout(out),
-            redirect_stderr(err), mock.patch.dict(os.environ), pytest.raises(SystemExit) as end,
-        ):  # fmt: skip
-            main()
-    finally:
-        os.chdir(before)
-    return int(end.value.code or 0), out.getvalue(), err.getvalue()
-
-
-def refused(folder: Path, *arguments: object) -> str:
-    """Return the one line in which a command is refused."""
-    code, _, err = latticebench(folder, *arguments)
-    assert code == 2, (arguments, err)
-    assert err.startswith("error: ")
-    assert err.count("\n") == 1, err
-    return err
 
 
 @pytest.fixture(scope="module")
@@ -73,23 +30,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a suite, its results, and its tables."""
     folder = tmp_path_factory.mktemp("made")
     (folder / "s.toml").write_text(SUITE)
-    assert latticebench(folder, "run", "s.toml", "--jobs", 1, "--results", "store")[0] == 0
-    assert latticebench(folder, "table", "store", "--out", "tables")[0] == 0
+    assert latticebench("run", "s.toml", "--jobs", 1, "--results", "store", cwd=folder)[0] == 0
+    assert latticebench("table", "store", "--out", "tables", cwd=folder)[0] == 0
     with sqlite3.connect(folder / "store" / FILE) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     connection.close()
     return folder
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-@contextmanager
-def unchanged(folder: Path) -> Iterator[None]:
-    before = content(folder)
-    yield
-    assert content(folder) == before
 
 
 def test_tables_that_are_read_are_not_replaced(made: Path, tmp_path: Path) -> None:
@@ -106,17 +52,17 @@ def test_tables_that_are_read_are_not_replaced(made: Path, tmp_path: Path) -> No
             ["compare", "tables", "--against", "other", "--out", "link/cases.csv"],
             ["compare", store, "--with", "tables", "--against", "other", "--out", table],
         ):  # fmt: skip
-            assert "read by the same command" in refused(tmp_path, *arguments)
+            assert "read by the same command" in refused(*arguments, cwd=tmp_path)
 
 
 def test_places_of_tables_and_figures_are_looked_at_before_anything_is_shown(made: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with unchanged(tmp_path):
         for command in (["table", made / "store"], ["figures", made / "store"]):
-            code, out, err = latticebench(tmp_path, *command, "--out", "file/within")
+            code, out, err = latticebench(*command, "--out", "file/within", cwd=tmp_path)
             assert (code, out) == (2, "")
             assert "cannot be written" in err
-        code, out, err = latticebench(tmp_path, "compare", made / "store", "--against", "other", "--out", "file/x")
+        code, out, err = latticebench("compare", made / "store", "--against", "other", "--out", "file/x", cwd=tmp_path)
         assert (code, out) == (2, "")
         assert "cannot be written" in err
 
@@ -139,7 +85,7 @@ def survive_run(made: Path, folder: Path, statement: str, *options: str) -> None
     connection = sqlite3.connect(folder / FILE)
     connection.executescript(statement)
     connection.close()
-    code, _, err = latticebench(made, "run", "s.toml", "--jobs", 1, "--results", folder, *options)
+    code, _, err = latticebench("run", "s.toml", "--jobs", 1, "--results", folder, *options, cwd=made)
     assert code in (0, 2), err
     assert code == 0 or err.splitlines()[-1].startswith("error: "), err
 
@@ -174,7 +120,7 @@ def test_a_name_of_a_folder_steers_no_terminal(made: Path, tmp_path: Path) -> No
         ["run", made / "s.toml", "--dry-run", "--results", odd], ["table", odd, "--out", f"{odd}2"],
         ["schema", "fit", "--out", odd], ["run", odd], ["figures", odd],
     ):  # fmt: skip
-        _, out, err = latticebench(tmp_path, *arguments)
+        _, out, err = latticebench(*arguments, cwd=tmp_path)
         assert out or err
         assert "\x1b" not in out + err, arguments
 
@@ -203,7 +149,7 @@ def test_what_a_damaged_store_says_of_a_run_is_told_or_refused_in_one_line(told:
     content = f"{json.dumps(whole)[:-1]}, {told[1:]}" if len(told) > 2 else told
     until = time.time() + 30
     store.connection.execute("INSERT INTO runs VALUES (?, ?, ?)", ("another machine 1 0.00 x", until, content))
-    code, out, err = latticebench(tmp_path, "status", "store")
+    code, out, err = latticebench("status", "store", cwd=tmp_path)
     assert code in (0, 2)
     assert code == 0 or (err.startswith("error: ") and err.count("\n") == 1), err
     assert "\x1b" not in out + err
@@ -245,7 +191,7 @@ def survive_tables(made: Path, folder: Path, seeds: range) -> None:
             ["figures", made / "store", "--with", tables, "--only", "noise", "--out", folder / "out"],
             ["compare", tables, "--against", "other"], ["publish", tables, "--out", folder / "site"],
         ):  # fmt: skip
-            code, out, err = latticebench(folder, *command)
+            code, out, err = latticebench(*command, cwd=folder)
             assert code in (0, 1, 2), (seed, command)
             assert code != 2 or (err.startswith("error: ") and err.count("\n") == 1), (seed, command, err)
             assert "\x1b" not in out + err, (seed, command)
@@ -283,9 +229,9 @@ def test_a_table_that_another_program_has_saved_is_read(tmp_path: Path) -> None:
 
 
 def test_a_fit_whose_motion_cannot_be_drawn_is_written_all_the_same(tmp_path: Path) -> None:
-    assert latticebench(tmp_path, "simulate", "phi4", "--sites", 4, "--samples", 10, "--out", "t.csv")[0] == 0
+    assert latticebench("simulate", "phi4", "--sites", 4, "--samples", 10, "--out", "t.csv", cwd=tmp_path)[0] == 0
     given = ["fit", "t.csv", "--order", 2, "--terms", "u[n]**0.5"]
-    assert latticebench(tmp_path, *given, "--method", "least-squares", "--json", "r.json")[0] == 0
+    assert latticebench(*given, "--method", "least-squares", "--json", "r.json", cwd=tmp_path)[0] == 0
     assert json.loads((tmp_path / "r.json").read_text())["method"] == "least-squares"
     for method in ("trajectory", "weak"):
-        assert "not finite" in refused(tmp_path, *given, "--method", method)
+        assert "not finite" in refused(*given, "--method", method, cwd=tmp_path)

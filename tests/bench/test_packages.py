@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import redirect_stdout
 from pathlib import Path
-from unittest import mock
 
 import pytest
 
+from commandline import succeed
 from latticebench import methods, systems
 from latticebench.bench.choice import chosen
-from latticebench.bench.cli import main
 from latticebench.bench.run import run
 from latticebench.bench.source import keys
 from latticebench.bench.store import create
@@ -123,14 +120,8 @@ def test_what_cannot_be_imported_is_a_row_that_names_the_package(site: Path, tmp
     ("kind", "good", "bad"), [("methods", "their-ridge", "broken"), ("systems", "springs", "lost")]
 )
 def test_lists_show_them_and_say_which_package_fails(site: Path, kind: str, good: str, bad: str) -> None:
-    out = io.StringIO()
-    with (
-        mock.patch.object(sys, "argv", ["latticebench", "list", kind, "--json"]), redirect_stdout(out),
-        pytest.raises(SystemExit) as end,
-    ):  # fmt: skip
-        main()
-    assert not end.value.code
-    rows = {row["name"]: row for row in json.loads(out.getvalue())["rows"]}
+    out = succeed("list", kind, "--json", cwd=site)
+    rows = {row["name"]: row for row in json.loads(out)["rows"]}
     assert good in rows
     assert "package broken 1.2" in str(rows[bad])
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
+from commandline import latticebench
 from latticebench import methods, systems
 from latticebench.bench import animation
 from latticebench.bench.adequacy import adequacy
-from latticebench.bench.cli import main
 from latticebench.bench.overlay import Overlay, of_fit, of_recording
 from latticebench.bench.plots import panels, plot
 from latticebench.bench.report.fit_page import fit_page
@@ -43,15 +42,12 @@ def swings() -> Samples:
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command within this process, and return its exit code and what it complains of."""
+def run(tmp_path: Path) -> Run:
+    """Run a command in the folder, and return its exit code and what it complains of."""
 
     def command(*words: str) -> tuple[int, str]:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["latticebench", *words])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return int(end.value.code or 0), capsys.readouterr().err
+        code, _, err = latticebench(*words, cwd=tmp_path)
+        return code, err
 
     return command
 
@@ -103,6 +99,14 @@ def test_every_panel_is_drawn_of_any_chain_with_gaps_and_uneven_times(sites: int
         figure = plot(overlay, list(panels(overlay)))
         figure.draw_without_rendering()
         assert sum(part.get_visible() for part in figure.get_axes()) >= len(panels(overlay))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-200, 1e49])
+def test_readings_of_any_size_are_drawn_without_a_warning(size: float, run: Run, tmp_path: Path) -> None:
+    t = np.arange(30) * 0.2
+    write([Samples(t, size * np.cos(t)[:, None] * np.ones(3))], tmp_path / "t.csv")
+    for words in (["inspect", "t.csv", "--out", "i.png"], ["plot", "t.csv", "--out", "p.png"]):
+        assert run(*words) == (0, "")
 
 
 def degrees(swings: Samples) -> Samples:

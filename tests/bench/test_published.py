@@ -25,7 +25,13 @@ def test_a_script_can_be_imported(script: Callable[[str], ModuleType], path: str
     assert script(path).__doc__
 
 
-@pytest.mark.parametrize("path", ["ablation/ablation.py", "cross/cross.py", "limits/which.py", "paper/claims.py"])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "ablation/ablation.py", "cross/cross.py", "default/kernels.py", "efficiency/efficiency.py", "limits/which.py",
+        "paper/claims.py",
+    ],
+)  # fmt: skip
 def test_a_page_is_what_its_script_makes_of_the_tables_beside_it(
     script: Callable[[str], ModuleType], path: str
 ) -> None:
@@ -34,7 +40,7 @@ def test_a_page_is_what_its_script_makes_of_the_tables_beside_it(
 
 
 def test_the_headline_is_what_the_paired_tests_say(script: Callable[[str], ModuleType]) -> None:
-    text = " ".join((RESULTS.parent / "docs" / "protocol.md").read_text(encoding="utf-8").split())
+    text = words("protocol")
     default, paper = (
         against(read_cases(RESULTS / name), "stlsq").methods.set_index("method") for name in ("default", "paper")
     )
@@ -55,6 +61,61 @@ def test_the_headline_is_what_the_paired_tests_say(script: Callable[[str], Modul
         f"(ratio {format_number(follows['ratio'])}, p = {format_number(follows['p'])})",
     ):
         assert told in text
+
+
+def words(page: str) -> str:
+    """Return the words of a page of docs/, one space between two."""
+    return " ".join((RESULTS.parent / "docs" / f"{page}.md").read_text(encoding="utf-8").split())
+
+
+def test_the_page_on_the_limit_says_what_the_table_of_efficiencies_says(script: Callable[[str], ModuleType]) -> None:
+    counts = script("efficiency/efficiency.py")
+    found, text = counts.measured(counts.load()), words("limit")
+    for part in counts.PARTS:
+        for method, group in found[found["part"] == part].groupby("method"):
+            assert f"`{method}` {counts.ends(group['efficiency'])}" in text, (part, method)
+
+
+def test_the_page_on_methods_says_what_the_table_of_limits_says(script: Callable[[str], ModuleType]) -> None:
+    shows = script("limits/which.py")
+    table = shows.load(shows.HERE)
+    own = table[(table["part"] == "noise") & (table["noise"] > 0) & table["own"]]
+    near = shows.arranged(own, ["system", "noise"], "efficiency")[list(shows.NEAR_BOUND)].stack()
+    text = words("method")
+    assert f"are {shows.span(1 / near)} times the bound" in text
+    assert f"has {shows.span(shows.error_ratio(own, 'stlsq', 'trajectory'))} times the error of `trajectory`" in text
+
+
+def test_the_trained_network_is_nearly_as_efficient_as_the_best_method_wherever_it_was_tried(
+    script: Callable[[str], ModuleType],
+) -> None:
+    counts = script("efficiency/efficiency.py")
+    found = counts.measured(counts.load())
+    network = found[found["method"] == "pinn-gn"]
+    assert set(zip(network["part"], network["noise"], strict=True)) >= {
+        ("noise", 0.1),
+        ("shaken", 0.1),
+        ("shaken", 0.01),
+    }
+    assert network["efficiency"].min() >= 0.65
+    assert network["beside"].max() < 1.2
+    assert not network["lost"].any()
+
+
+def test_the_published_spread_covers_what_another_kernel_does(script: Callable[[str], ModuleType]) -> None:
+    check = script("default/kernels.py")
+    table = pd.read_csv(RESULTS / "default" / "kernels.csv", comment="#")
+    assert len(table) >= check.SHARE * len(
+        read_cases(RESULTS / "default").query("method != 'zero'").dropna(subset="e2")
+    )
+    found = check.compared(table).set_index("method")
+    several = found["seeds"] > 1
+    # Without draws of its own a method repeats itself; with them it scatters no more than its seeds do.
+    assert (found.loc[~several, "covered"] == found.loc[~several, "fits"]).all()
+    assert (found.loc[several, "covered"] >= found.loc[several, "fits"] * 2 / 3).all()
+    told = found.loc["pinn"]
+    assert f"{told['covered']:g} of {told['fits']:g} fits of `pinn`" in words("protocol")
+    assert f"at most {format_number(found.loc['pinn-gn', 'largest change'])}" in words("protocol")
 
 
 def test_the_constants_in_use_are_those_that_their_table_chooses_on_lattices_outside_the_benchmark(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
-from latticebench.bench import cli, recordings
+from commandline import refused, succeed
+from latticebench.bench import recordings
 from latticebench.bench.recordings import RECORDINGS, Recording, find, fingerprint, take
 from latticebench.systems.errors import InputError
 from latticebench.systems.readers import read
@@ -25,13 +25,6 @@ def own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     swing = Recording("swing", "a swing", "t,u1", 2, "1 Hz", "a playground", "none", fingerprint(file))
     monkeypatch.setattr(recordings, "RECORDINGS", (swing,))
     return file
-
-
-def typed(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["latticebench", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 @pytest.mark.parametrize("recording", RECORDINGS, ids=lambda one: one.name)
@@ -54,13 +47,9 @@ def test_every_recording_names_its_source_licence_and_fingerprint() -> None:
         assert len(one.sha256) == 64
 
 
-def test_the_list_is_text_for_people_and_json_for_programs(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert typed(monkeypatch, "data", "--json") == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    assert typed(monkeypatch, "data") == 0
-    shown = capsys.readouterr().out
+def test_the_list_is_text_for_people_and_json_for_programs(tmp_path: Path) -> None:
+    rows = json.loads(succeed("data", "--json", cwd=tmp_path))["rows"]
+    shown = succeed("data", cwd=tmp_path)
     assert [row["name"] for row in rows] == [one.name for one in RECORDINGS]
     for row in rows:
         for key in ("name", "what", "source", "licence", "sha256"):
@@ -109,13 +98,9 @@ def test_an_unknown_recording_is_answered_with_the_nearest() -> None:
         find("glider")
 
 
-def test_the_command_takes_a_copy_and_complains_in_one_line(
-    own: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert typed(monkeypatch, "data", "take", "swing", own.name, "kept") == 0
-    assert capsys.readouterr().out == f"{Path('kept/swing.csv')}: copied, SHA-256 as it should be\n"
+def test_the_command_takes_a_copy_and_complains_in_one_line(own: Path) -> None:
+    out = succeed("data", "take", "swing", own.name, "kept", cwd=own.parent)
+    assert out == f"{Path('kept/swing.csv')}: copied, SHA-256 as it should be\n"
     own.write_text("t,u1\n")
-    assert typed(monkeypatch, "data", "take", "swing", own.name, "again") == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: downloaded file.csv: its SHA-256 is ")
-    assert error.count("\n") == 1
+    line = refused("data", "take", "swing", own.name, "again", cwd=own.parent)
+    assert line.startswith("error: downloaded file.csv: its SHA-256 is ")

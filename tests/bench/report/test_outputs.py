@@ -14,7 +14,7 @@ import numpy as np
 import pydantic
 import pytest
 
-from latticebench.bench import cli
+from commandline import refused, succeed
 from latticebench.bench.adequacy import Adequacy
 from latticebench.bench.case import Case
 from latticebench.bench.compare import compare, of_fits
@@ -44,16 +44,6 @@ Conforms = Callable[[str, str], dict[str, Any]]
 SCHEMAS = resources.files("latticebench.bench.report") / "schemas"
 
 
-def typed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Type a command and return what it prints."""
-    monkeypatch.setattr("sys.argv", ["latticebench", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    shown = capsys.readouterr()
-    assert not end.value.code, shown.err
-    return shown.out
-
-
 def test_the_published_schemas_are_those_of_the_documents() -> None:
     assert {path.name for path in SCHEMAS.iterdir()} == {f"{kind}.json" for kind in DOCUMENTS}
     for kind in DOCUMENTS:
@@ -62,24 +52,17 @@ def test_the_published_schemas_are_those_of_the_documents() -> None:
         jsonschema.Draft202012Validator.check_schema(json.loads(published))
 
 
-def test_schemas_can_be_listed_printed_and_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert typed(monkeypatch, capsys, "schema").split() == sorted(DOCUMENTS)
-    assert typed(monkeypatch, capsys, "schema", "fit") == json_schema("fit")
-    typed(monkeypatch, capsys, "schema", "--out", str(tmp_path / "new"))
+def test_schemas_can_be_listed_printed_and_written(tmp_path: Path) -> None:
+    assert succeed("schema", cwd=tmp_path).split() == sorted(DOCUMENTS)
+    assert succeed("schema", "fit", cwd=tmp_path) == json_schema("fit")
+    succeed("schema", "--out", str(tmp_path / "new"), cwd=tmp_path)
     assert (tmp_path / "new" / "limit.json").read_text() == json_schema("limit")
-    typed(monkeypatch, capsys, "schema", "fit", "--out", str(tmp_path / "one"))
+    succeed("schema", "fit", "--out", str(tmp_path / "one"), cwd=tmp_path)
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["fit.json"]
 
 
-def test_an_unknown_schema_is_refused_with_those_that_there_are(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("sys.argv", ["latticebench", "schema", "fits"])
-    with pytest.raises(SystemExit):
-        cli.main()
-    assert "unknown document 'fits'" in capsys.readouterr().err
+def test_an_unknown_schema_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
+    assert "unknown document 'fits'" in refused("schema", "fits", cwd=tmp_path)
 
 
 class Numbers(Content):
@@ -105,29 +88,24 @@ def test_a_document_of_another_version_is_refused() -> None:
         FitDocument.model_validate_json(text.replace("fit/1", "fit/2"))
 
 
-def test_a_fit_and_a_limit_are_written_in_the_published_form(
-    conforms: Conforms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_fit_and_a_limit_are_written_in_the_published_form(conforms: Conforms, tmp_path: Path) -> None:
     system = ["--system", "phi4", "--library", "lib1"]
-    typed(monkeypatch, capsys, "simulate", "phi4", "--sites", "9", "--samples", "20", "--out", "a b.csv")
+    succeed("simulate", "phi4", "--sites", "9", "--samples", "20", "--out", "a b.csv", cwd=tmp_path)
     fit = ["fit", "a b.csv", *system, "--method", "least-squares", "--seed", "7", "--json"]
-    found = conforms("fit", typed(monkeypatch, capsys, *fit, "-"))
+    found = conforms("fit", succeed(*fit, "-", cwd=tmp_path))
     assert found["provenance"]["command"] == "latticebench fit 'a b.csv' " + " ".join([*fit[2:], "-"])
     assert found["provenance"]["seeds"] == [7]
     assert found["provenance"]["versions"]["numpy"] == np.__version__
     assert found["stderr"] is None
-    assert "u''" in typed(monkeypatch, capsys, *fit, "fit.json")
+    assert "u''" in succeed(*fit, "fit.json", cwd=tmp_path)
     assert conforms("fit", (tmp_path / "fit.json").read_text())["coefficients"] == found["coefficients"]
-    bound = conforms("limit", typed(monkeypatch, capsys, "limit", *system, "--sites", "9", "--json", "-"))
+    bound = conforms("limit", succeed("limit", *system, "--sites", "9", "--json", "-", cwd=tmp_path))
     assert list(bound["terms"]) == list(found["coefficients"])
     assert (found["warnings"], found["quality"]["fits"], bound["warnings"]) == ([], True, [])
 
 
-def test_recordings_are_listed_in_the_published_form(
-    conforms: Conforms, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    found = conforms("list", typed(monkeypatch, capsys, "data", "--json"))
+def test_recordings_are_listed_in_the_published_form(conforms: Conforms, tmp_path: Path) -> None:
+    found = conforms("list", succeed("data", "--json", cwd=tmp_path))
     assert found["kind"] == "recordings"
 
 

@@ -15,7 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from latticebench.bench.cli import main
+from commandline import refused
 from latticebench.bench.colours import series
 from latticebench.bench.overlay import Overlay
 from latticebench.bench.report.shown import Shown
@@ -34,16 +34,6 @@ def read(path: Path) -> list[dict[str, str]]:
     """Read a table as it lies in the results, with a reader of this file's own."""
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
     return list(csv.DictReader(lines))
-
-
-def refused(arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
-    """Run `publish`, which must refuse in one line, and return that line."""
-    monkeypatch.setattr(sys, "argv", ["latticebench", "publish", *arguments])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
 
 
 @pytest.mark.parametrize("name", ["default", "efficiency", "paper", "limits"])
@@ -221,45 +211,39 @@ def test_a_number_is_written_with_three_digits(cell: str, shown: str) -> None:
     ],
 )  # fmt: skip
 def test_a_damaged_folder_is_refused_in_one_line_and_nothing_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
-    name: str, content: str, told: str,
+    tmp_path: Path, name: str, content: str, told: str,
 ) -> None:  # fmt: skip
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / name).write_text(content)
-    line = refused([str(folder), "--out", str(tmp_path / "site")], capsys, monkeypatch)
+    line = refused("publish", folder, "--out", "site", cwd=tmp_path)
     assert told in line
     assert str(folder) in line
     assert not (tmp_path / "site").exists()
 
 
-def test_what_is_no_folder_of_results_is_refused(
-    tmp_path: Path, published: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_folder_of_results_is_refused(tmp_path: Path, published: Path) -> None:
     (tmp_path / "a" / "mine").mkdir(parents=True)
     shutil.copytree(published, tmp_path / "b" / "mine")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "store.json").write_text("{}")
-    out = ["--out", str(tmp_path / "site")]
     for given, told in (
-        (["none"], "no such folder"), ([str(published / "cases.csv")], "a file, not a folder"),
-        ([str(published), str(tmp_path / "b" / "mine")], "two folders are called 'mine'"),
-        ([str(tmp_path / "a" / "mine")], "there is nothing in it"),
-        ([str(tmp_path / "run")], "publish their tables first: latticebench table"),
+        (["none"], "no such folder"), ([published / "cases.csv"], "a file, not a folder"),
+        ([published, "b/mine"], "two folders are called 'mine'"),
+        (["a/mine"], "there is nothing in it"),
+        (["run"], "publish their tables first: latticebench table"),
     ):  # fmt: skip
-        assert told in refused([*given, *out], capsys, monkeypatch)
+        assert told in refused("publish", *given, "--out", "site", cwd=tmp_path)
 
 
-def test_only_a_site_of_this_command_is_replaced(
-    tmp_path: Path, published: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_site_of_this_command_is_replaced(tmp_path: Path, published: Path) -> None:
     mine = tmp_path / "letters"
     mine.mkdir()
     (mine / "index.html").write_text("mine")
-    assert "not a site of this command" in refused([str(published), "--out", str(mine)], capsys, monkeypatch)
+    assert "not a site of this command" in refused("publish", published, "--out", mine, cwd=tmp_path)
     assert [one.name for one in mine.iterdir()] == ["index.html"]
     for place in (published, published / "site", published.parent):
-        assert "it lies in" in refused([str(published), "--out", str(place)], capsys, monkeypatch)
+        assert "it lies in" in refused("publish", published, "--out", place, cwd=tmp_path)
     out = tmp_path / "site"
     first = build([published], out, HERE)
     (out / "mine" / "index.html").write_text("old")
@@ -267,7 +251,7 @@ def test_only_a_site_of_this_command_is_replaced(
     assert (out / "mine" / "index.html").read_text() != "old"
     assert {one.relative_to(out).as_posix() for one in out.rglob("*") if one.is_file()} == {*first, MANIFEST}
     (out / "notes.txt").write_text("mine")
-    assert "notes.txt is not of the site" in refused([str(published), "--out", str(out)], capsys, monkeypatch)
+    assert "notes.txt is not of the site" in refused("publish", published, "--out", out, cwd=tmp_path)
     assert (out / "notes.txt").read_text() == "mine"
     assert sorted(one.name for one in tmp_path.iterdir()) == ["letters", "site"]
 
