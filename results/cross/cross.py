@@ -95,7 +95,7 @@ def page() -> str:
         f"{succeeded} succeeded. `own terms` is the library of the four terms of the lattice's own equation, "
         f"`large` one of 10 to 13 terms. Each entry has {many} seeds ({slow} for `trajectory`) "
         f"with noise and {single} without.\n",
-        "## With noise (0.1, 1, 5, 10 %)\n",
+        f"## With noise ({', '.join(f'{100 * level:g}' for level in sorted(noisy['noise'].unique()))} %)\n",
         markdown(by_method(noisy)),
         "\nEach library has a bound of its own, for a method that keeps all of its terms; that of a large library is "
         "larger. `weak`, `stlsq` and `sr3` select terms; `trajectory` keeps them all (`trajectory-select` is compared "

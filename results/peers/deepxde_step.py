@@ -10,9 +10,9 @@ times, 50 samples of u and v, double precision, one thread, Adam. DeepXDE is mea
 - the same with all outputs in one `PointSetBC`;
 - with its forward mode, which needs one pass for all outputs.
 
-The time per step is the difference between a long and a short training over the difference of their numbers of steps,
-so that set-up and the evaluation at the end cancel. The four programs are measured in turn, `--rounds` times, and their
-medians are compared. The script needs `deepxde>=1.15,<1.16` (the extra `peers`) and writes step_time.csv and
+The processor time per step is the difference between a long and a short training over the difference of their numbers
+of steps, so that set-up and the evaluation at the end cancel. The four programs are measured in turn, `--rounds` times,
+and their medians are compared. The script needs `deepxde>=1.15,<1.16` (the extra `peers`) and writes step_time.csv and
 step_time.md.
 """
 
@@ -44,20 +44,20 @@ SYSTEM, LIBRARY, COLLOCATION = "phi4", "lib2", 201
 
 
 def ours() -> Callable[[int], float]:
-    """Return the function that trains this project's PINN for a number of steps and returns the seconds."""
+    """Return the function that trains this project's PINN for a number of steps and returns the processor seconds."""
     system = systems.find(SYSTEM)
     samples, library = simulate(system).observed(), system.library(LIBRARY)
 
     def train(steps: int) -> float:
-        start = time.perf_counter()
+        start = time.process_time()
         PINN(collocation=COLLOCATION, adam_steps=steps, lbfgs_steps=0).fit([samples], library, system.order, 0)
-        return time.perf_counter() - start
+        return time.process_time() - start
 
     return train
 
 
 def deepxde(mode: str, *, each: bool = False) -> Callable[[int], float]:
-    """Return the function that trains DeepXDE's PINN for a number of steps and returns the seconds.
+    """Return the function that trains DeepXDE's PINN for a number of steps and returns the processor seconds.
 
     Args:
         mode: "reverse", DeepXDE's default, or "forward".
@@ -104,9 +104,9 @@ def deepxde(mode: str, *, each: bool = False) -> Callable[[int], float]:
 
     def train(steps: int) -> float:
         dde.config.set_default_autodiff(mode)
-        start = time.perf_counter()
+        start = time.process_time()
         model.train(iterations=steps, display_every=10**9, verbose=0)
-        return time.perf_counter() - start
+        return time.process_time() - start
 
     return train
 
