@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: bench test test-slow speed lint types wheel docs clean
+.PHONY: bench test test-slow mutants speed lint types wheel docs clean
 
 bench: $(READY)
 	$(BIN)/latticebench run default --results runs/default
@@ -17,6 +17,14 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow --benchmark-disable -n 2 --dist worksteal
+
+# Changes the code in one place at a time and sees whether the tests notice; some minutes a module.
+mutants: $(VENV)/.mutants
+	nice $(BIN)/python results/mutants/mutants.py
+
+$(VENV)/.mutants: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.txt --no-build-isolation -e ".[mutants]"
+	@touch $(VENV)/.mutants
 
 speed: $(READY)
 	$(BIN)/python -m pytest tests/speed --benchmark-only

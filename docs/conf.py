@@ -60,6 +60,8 @@ sphinx_gallery_conf = {
     "gallery_dirs": "gallery",
     "abort_on_example_error": True,
     "show_memory": False,
+    # Its tables would be loaded from the network.
+    "write_computation_times": False,
     "remove_config_comments": True,
     "download_all_examples": False,
     "image_scrapers": ("matplotlib",),
