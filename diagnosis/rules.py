@@ -17,8 +17,9 @@ STAND_INS = frozenset({"disorder"})
 # A wave or a pulse has to stand out from its surroundings: its price is as many times as high as others beside it win
 # what noise lets them, for where an equation misfits, every frequency or time near by wins something. Beside a wave are
 # those from so many steps of half a resolution away, where a line has fallen to a hundredth, up to so many; beside a
-# pulse are as many of its width that are at least so many widths away. Of fewer the median says nothing.
-LINE, AROUND, APART, FEW_AROUND = 4, 24, 4.0, 8
+# pulse are as many of its width that are at least so many widths away. Of fewer the median says nothing; that of the
+# others counts beyond the quantile to which noise brings it with this chance: of two dozen it scatters by a half.
+LINE, AROUND, APART, FEW_AROUND, CROWDED = 4, 24, 4.0, 8, 0.975
 # Stretches of the recordings whose numbers are compared: where they differ by more than the noise lets them, all
 # evidence is that much less. Twice as many can hold twice the evidence of what is no noise; a few periods must fit in.
 STRETCHES = 32
@@ -34,7 +35,8 @@ MOST_EFFECTS = 8
 # these readings.
 EQUAL = 3.0
 # Influences with a frequency or a time of their own are looked for on horizons of so many periods of the main
-# frequency: on shorter ones they stand in for whatever is missing.
+# frequency: on shorter ones they stand in for whatever is missing. Where a sensor shows plainly that something is
+# still missing, they are looked for at once.
 PERIODS = 3.0
 # Horizons begin at this share of the shortest period, where a wrong equation can follow, too.
 FIRST_HORIZON = 0.5

@@ -8,17 +8,17 @@ integration (Rao's score test; nuisance parameters are projected out).
 from __future__ import annotations
 
 import copy
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import gammaincinv
+from scipy.special import betaincinv, gammaincinv
 
 from latticebench.diagnosis import rules
-from latticebench.diagnosis.acting import Force, Placed
+from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted, by_pieces, gain, normal, scaled_inverse, whitened
+from latticebench.diagnosis.glance import columns_of, glanced
 from latticebench.diagnosis.horizon import fields
 from latticebench.diagnosis.model import Assembled, Model, read_term
 from latticebench.diagnosis.propagation import propagate
@@ -32,11 +32,8 @@ if TYPE_CHECKING:
 
 # Numbers that are worked on at a time.
 CHUNK = 2_000_000
-# Random directions of readings that a force's curvature is estimated from, directions of its numbers that are one, and
-# candidates of a kind whose score is then computed.
-DIRECTIONS, ALIKE, LIKELIEST = 24, 1e-3, 12
-# Seed of the directions: the same each time, so that a diagnosis is.
-SIGNS = 0
+# Candidates of a kind whose score is computed in full.
+LIKELIEST = 12
 # Directions that the model can do already, as a share of what a candidate does.
 OLD = 1e-4
 
@@ -123,7 +120,6 @@ class Tangent:
         # Of the effects that it is in the place of: by how much the sum of squares grows without them.
         self.taken = 0.0
         self._kept: list[_Responses] = []
-        self.courses: dict[tuple[int, str, bytes], ndarray] = {}
         self.terms: dict[tuple[int, str], ndarray] = {}
         self.evaluators: dict[tuple[int, tuple[int, int]], Callable[[Term], ndarray]] = {}
 
@@ -170,7 +166,7 @@ class Tangent:
         batch: list[Placed] = []
         for one in sorted(candidates, key=lambda one: one.instrument):
             batch.append(one)
-            if sum(map(_columns_of, batch)) * self.error.size > CHUNK:
+            if sum(map(columns_of, batch)) * self.error.size > CHUNK:
                 yield batch
                 batch = []
         if batch:
@@ -190,15 +186,14 @@ class Tangent:
 
     def _other(self, left: ndarray, basis: ndarray, taken: float = 0.0) -> Tangent:
         other = copy.copy(self)
-        other.__dict__.pop("_duals", None)
-        other.courses, other.left, other.basis, other.taken = {}, left, basis, taken
+        other.left, other.basis, other.taken = left, basis, taken
         return other
 
     def likeliest(
         self, candidates: Sequence[Placed], price: Callable[[Placed], float], kind: Callable[[Placed], object]
     ) -> list[Placed]:
         """Return the few candidates of each kind that are likely to win most beyond their price."""
-        gains = self._glanced(candidates)
+        gains = glanced(self, candidates)
         ranked = sorted(zip(gains, candidates, strict=True), key=lambda pair: price(pair[1]) - pair[0])
         kept: dict[object, list[Placed]] = {}
         for _, one in ranked:
@@ -212,83 +207,11 @@ class Tangent:
             return 1.0
         # A line has wings.
         basis = _orthonormal(np.concatenate([self.free, self._responses([placed]).columns], axis=1))
-        usual = float(np.median(self._other(self.left - basis @ (basis.T @ self.left), basis)._glanced(others)))
-        return max(1.0, usual / float(gammaincinv(len(placed.strength) / 2, 0.5)))
-
-    def _glanced(self, candidates: Sequence[Placed]) -> list[float]:
-        """Return about how many nats forces would win, without what each of them would do to the readings.
-
-        The slope of the likelihood by a force follows from its adjoint. Its curvature is a mean square over random
-        directions in the space of readings (Hutchinson, Commun. Stat. Simul. Comput. 18, 1059 (1989)).
-        """
-        found = []
-        for one in candidates:
-            by = np.zeros((_columns_of(one), 1 + DIRECTIONS))
-            for number in range(len(self.along)):
-                by += self._pulled(number, one)
-            # What overflows along the motion wins nothing.
-            by = np.where(np.isfinite(by), by, 0.0)
-            size = np.linalg.norm(by[:, 1:], axis=1, keepdims=True)
-            scaled = by / np.where(size > 0, size, 1.0)
-            u, values, _ = np.linalg.svd(scaled[:, 1:], full_matrices=False)
-            held = values > ALIKE
-            found.append(self._gain(float(DIRECTIONS * np.sum((u[:, held].T @ scaled[:, 0] / values[held]) ** 2))))
-        return found
-
-    def _pulled(self, number: int, one: Placed) -> ndarray:
-        """Return derivatives of what is left, and of random directions, by the numbers of an effect: (., 1 + D)."""
-        along, dual, found = self.along[number], self._duals[number], np.zeros((_columns_of(one), 1 + DIRECTIONS))
-        if one.scaled() is not None or one.other_ends() is not None:
-            return np.asarray(self._push(number, one).reshape(len(found), -1) @ dual)
-        for force in one.forces(self.fitted.chain):
-            factor = force.factor_of(number)
-            course = np.ones((1, len(along.t), 1)) if factor is None else factor(along.t)
-            if course.shape[0] * course.shape[2] > 1:
-                return np.asarray(self._push(number, one).reshape(len(found), -1) @ dual)
-            value = course[0, :, 0] @ self._in_time(number, force)
-            for k, share in force.by.items():
-                found[k] += share * value
-        return found
-
-    def _in_time(self, number: int, force: Force) -> ndarray:
-        """Return derivatives by a force's factor at each time: (rows, 1 + D)."""
-        key = number, force.text, b"" if force.weights is None else force.weights.tobytes()
-        if key not in self.courses:
-            values, chain = self._term(number, force.text), self.fitted.chain
-            if force.weights is not None:
-                values = values * force.weights[list(chain.moving)]
-            dual = self._duals[number].reshape(*values.shape, -1)
-            self.courses[key] = np.einsum("rqn,rqnk->rk", values, dual)
-        return self.courses[key]
-
-    @functools.cached_property
-    def _duals(self) -> list[ndarray]:
-        """Derivatives of what is left, and of random directions, by forces in each recording: (rows parts M, 1 + D)."""
-        layout, shape = self.fitted.layout, self.error.shape
-        signs = np.random.default_rng(SIGNS).choice([-1.0, 1.0], (*shape, DIRECTIONS))
-        looked = np.concatenate([self.left[:, None], self._new(by_pieces(layout, signs))], axis=1)
-        readings = self.whitener.transposed(looked.reshape(*shape, -1) * self.robust[..., None])
-        found, begin = [], 0
-        for number, rows in enumerate(layout.rows):
-            part = readings[begin : begin + rows.size] * self._own(number)[..., None]
-            begin += rows.size
-            found.append(self._dual(number, part))
-        return found
-
-    def _dual(self, number: int, readings: ndarray) -> ndarray:
-        """Return derivatives by forces from those by the readings' fields (rows, channels, 1 + D)."""
-        layout, along, chain = self.fitted.layout, self.along[number], self.fitted.chain
-        (pieces, m), count = layout.rows[number].shape, readings.shape[-1]
-        fields = readings.reshape(pieces, m, chain.levels, chain.parts, chain.sites, count)[..., layout.plain.moving, :]
-        by_state = np.zeros((pieces, m, count, chain.order, *fields.shape[3:5]))
-        by_state[:, :, :, : chain.levels] = np.moveaxis(fields, -1, 2)
-        by_state = by_state.reshape(pieces, m, count, -1)
-        back = np.swapaxes(self.followed.transitions[number][:, ::-1], 2, 3)
-        carried = propagate(back, by_state[:, -2::-1], by_state[:, -1])[:, ::-1]
-        dual = np.zeros((pieces, m, chain.parts, len(chain.moving), count))
-        dual[:, :-1] += np.einsum("pjqns,pjks->pjqnk", along.early, carried[:, 1:], optimize=True)
-        dual[:, 1:] += np.einsum("pjqns,pjks->pjqnk", along.late, carried[:, 1:], optimize=True)
-        return dual.reshape(-1, count)
+        usual = float(np.median(glanced(self._other(self.left - basis @ (basis.T @ self.left), basis), others)))
+        # The quantile of a chance that the median of so many reaches in noise.
+        half = (len(others) + 1) / 2
+        chance = float(betaincinv(half, half, rules.CROWDED))
+        return max(1.0, usual / float(gammaincinv(len(placed.strength) / 2, chance)))
 
     def start(
         self, placed: Placed, dropped: Sequence[int] = ()
@@ -349,7 +272,7 @@ class Tangent:
         found = [one - local @ (inverse @ (np.swapaxes(local, 1, 2) @ one)) for one, local, inverse in parts]
         return np.concatenate([one.reshape(-1, one.shape[-1]) for one in found])
 
-    def _new(self, pieces: Sequence[ndarray]) -> ndarray:
+    def new(self, pieces: Sequence[ndarray]) -> ndarray:
         """Return what columns do to the readings that nothing in the model can do."""
         new = self._moving_on(pieces)
         return np.asarray(new - self.basis @ (self.basis.T @ new))
@@ -364,7 +287,7 @@ class Tangent:
         does = np.zeros((len(self.left), len(batch)))
         can = np.zeros((self.basis.shape[1], len(batch)))
         for k, one in enumerate(batch):
-            block = slice(begin, begin + _columns_of(one))
+            block = slice(begin, begin + columns_of(one))
             begin = block.stop
             part = seen.columns[:, block] / unit[block]
             curved = part.T @ part - shared[:, block].T @ shared[:, block]
@@ -397,7 +320,7 @@ class Tangent:
             gains += gain(total, after, count, self.fitted.least[number]) if count else 0.0
         return [float(one) for one in gains]
 
-    def _gain(self, won: float) -> float:
+    def gain(self, won: float) -> float:
         """Return the nats that so much of the sum of squares is worth, the size of the noise being free."""
         total, count = float(np.sum(self.error**2)), float(np.sum(self._read))
         return float(gain(total, total - won, count, np.min(self.fitted.least)))
@@ -411,7 +334,7 @@ class Tangent:
         if forces:
             z = self._moved(number, forces)
             field = np.moveaxis(layout.plain.whole(z, None)[:, :, : chain.levels], 1, -1)
-            blocks.append(field.reshape(rows.size, -1, z.shape[1]) * self._own(number)[..., None])
+            blocks.append(field.reshape(rows.size, -1, z.shape[1]) * self.own(number)[..., None])
         for one in batch:
             if one.instrument:
                 by = one.misread(along.t, along.field).by
@@ -422,7 +345,7 @@ class Tangent:
         """Return what the numbers of forces do to the states of one recording: (rows, numbers, S)."""
         layout, along = self.fitted.layout, self.along[number]
         chain, rows = layout.chain, layout.rows[number]
-        pushes = [self._push(number, one) for one in forces]
+        pushes = [self.push(number, one) for one in forces]
         push = np.concatenate(pushes).reshape(-1, *rows.shape, chain.parts, len(chain.moving))
         forced = np.einsum("cpjqn,pjqns->pjcs", push[:, :, :-1], along.early, optimize=True)
         forced += np.einsum("cpjqn,pjqns->pjcs", push[:, :, 1:], along.late, optimize=True)
@@ -430,15 +353,16 @@ class Tangent:
         z = propagate(self.followed.transitions[number], forced, still)
         return z.reshape(rows.size, len(push), -1)
 
-    def _own(self, number: int) -> ndarray:
+    def own(self, number: int) -> ndarray:
+        """Return the derivatives of one recording's readings by their own fields: (rows, channels)."""
         begin = sum(rows.size for rows in self.fitted.layout.rows[:number])
         return self.fitted.followed.own[begin : begin + self.fitted.layout.rows[number].size]
 
-    def _push(self, number: int, one: Placed) -> ndarray:
+    def push(self, number: int, one: Placed) -> ndarray:
         """Return the forces of an effect's numbers, or of one without any, along the motion: (., rows, parts, M)."""
         layout, along = self.fitted.layout, self.along[number]
         chain, dynamics = layout.chain, along.assembled.dynamics
-        push = np.zeros((_columns_of(one), len(along.t), chain.parts, len(chain.moving)))
+        push = np.zeros((columns_of(one), len(along.t), chain.parts, len(chain.moving)))
         site, ends = one.scaled(), one.other_ends()
         if site is not None:
             index = chain.moving.index(site)
@@ -446,7 +370,7 @@ class Tangent:
         if ends is not None:
             push[0] = self._rate(number, replace(dynamics, ends=ends)) - self._rate(number, dynamics)
         for force in one.forces(chain):
-            values = self._term(number, force.text)
+            values = self.term(number, force.text)
             if force.weights is not None:
                 values = values * force.weights[dynamics.moving]
             factor = force.factor_of(number)
@@ -469,7 +393,7 @@ class Tangent:
         inputs = self.fitted.layout.records[number].stretches.inputs
         return None if inputs is None else inputs(self.along[number].t)
 
-    def _term(self, number: int, text: str) -> ndarray:
+    def term(self, number: int, text: str) -> ndarray:
         """Return the values of a term along the motion: (rows, parts, M)."""
         if (number, text) not in self.terms:
             term = read_term(text)
@@ -485,11 +409,6 @@ class Tangent:
             wide = replace(base, least_reach=(left, right))
             self.evaluators[number, reach] = wide.evaluator(along.t, along.states, self._input(number), along.driven)
         return self.evaluators[number, reach]
-
-
-def _columns_of(one: Placed) -> int:
-    """Return how many columns an effect has: one per number, or one for what it does without any."""
-    return max(len(one.numbers), 1)
 
 
 def _orthonormal(columns: Float[ndarray, "readings numbers"]) -> Float[ndarray, "readings held"]:

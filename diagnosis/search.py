@@ -87,7 +87,8 @@ class Search:
             self.lengths.append(length)
             whole = length >= self._longest
             waves = length * self.problem.step * self.problem.main / (2 * np.pi)
-            late = whole or waves >= rules.PERIODS or (last is not None and misfits(self.problem, last.models[0]))
+            strays = last is not None and misfits(self.problem, last.models[0], anywhere=True)
+            late = whole or waves >= rules.PERIODS or strays
             self.open = tuple(one for one in self.problem.candidates if late or not one.timed)
             before, fits = carried[0], list(carried[1:])
             self.say(f"following pieces of {waves:.3g} periods")

@@ -58,14 +58,20 @@ def lost(problem: Problem, fitted: Fitted) -> bool:
     return large and fitted.has_lines()
 
 
-def misfits(problem: Problem, fitted: Fitted) -> bool:
-    """Return whether even what is new from one reading to the next swings, and is far beyond noise at all sensors."""
+def misfits(problem: Problem, fitted: Fitted, *, anywhere: bool = False) -> bool:
+    """Return whether even what is new from one reading to the next swings, and is far beyond noise.
+
+    Args:
+        problem: the recordings.
+        fitted: the model.
+        anywhere: whether it is enough that it is so at one sensor; else it is at all that have noise.
+    """
     noise = fitted.noise
     time = np.where(noise.memory > 0, noise.memory, 1e-9 * problem.step)
     new = noise.size * np.sqrt(-np.expm1(-2 * problem.step / time))
     known = problem.noise > 0
-    large = np.any(known) and np.all(new[known] > rules.LOST * problem.noise[known])
-    return bool(large) and fitted.has_lines()
+    large = new[known] > rules.LOST * problem.noise[known]
+    return bool(np.any(large) and (anywhere or np.all(large))) and fitted.has_lines()
 
 
 def repelling(problem: Problem, model: Model) -> float:

@@ -17,11 +17,14 @@ from latticebench.systems.parser import TermError, parse
 HOW: dict[str, str] = {
     "everywhere": "the formula, at every site and time",
     "harmonic": "the formula times cos(omega t) and sin(omega t), at every site alike; omega found",
+    "harmonic at one site": "the same at one site only; omega and site found",
     "pulse": "the formula times exp(-((t - at) / width)^2 / 2), at every site alike; at and width found",
+    "pulse at one site": "the same at one site only; at, width and site found",
     "delayed": "the formula of the field a delay earlier; delay found",
     "long range": "sum over r >= 2 of (u_{n+r} + u_{n-r} - 2 u_n) / r^s; s found",
     "alternating": "the formula with the sign (-1)^k at site k",
     "one site": "the formula at one site only; site found",
+    "one bond": "the formula at one site, and its mirror image, n+1 and n-1 exchanged, at the next; site found",
     "every site": "the formula at every site with a coefficient of its own",
     "one equation": "the whole right-hand side of one site is scaled; site found",
     "ends": "the chain ends in another way than declared",
@@ -213,6 +216,22 @@ CATALOGUE: tuple[Effect, ...] = (
     ),
     # Places.
     Effect("defect", "u[n]", acts="one site", look_for="a residual at one site and its neighbours", source=BRAUN),
+    Effect(
+        "bond-defect", "u[n+1]-u[n]", acts="one bond",
+        look_for="a residual of opposite sign at two neighbours", source=BRAUN,
+    ),
+    Effect(
+        "local-damping", "v[n]", acts="one site", orders=(2,),
+        look_for="amplitudes that fall fastest where one site moves most", source=NAYFEH,
+    ),
+    Effect(
+        "local-drive", "1", acts="harmonic at one site",
+        look_for="one line in the spectrum of the residual, at one site and what it moves", source=NAYFEH,
+    ),
+    Effect(
+        "local-kick", "1", acts="pulse at one site",
+        look_for="a residual that begins at one time and site, and spreads", source=NAYFEH,
+    ),
     Effect(
         "unequal-masses", "u[n]", acts="one equation",
         look_for="one site that answers all forces too much or too little", source=BRAUN,

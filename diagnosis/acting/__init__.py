@@ -8,6 +8,7 @@ from latticebench.diagnosis.acting.placed import (
     AtOneSite,
     Chain,
     Force,
+    InStep,
     Misreading,
     OfSensors,
     Placed,
@@ -21,5 +22,5 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 __all__ = [
-    "WAYS", "AtOneSite", "Chain", "Force", "Misreading", "OfSensors", "Placed", "Scene", "Summand", "way_of",
+    "WAYS", "AtOneSite", "Chain", "Force", "InStep", "Misreading", "OfSensors", "Placed", "Scene", "Summand", "way_of",
 ]  # fmt: skip

@@ -3,20 +3,39 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
 from latticebench.diagnosis import rules
-from latticebench.diagnosis.acting.placed import Chain, Force, Placed, Scene, Summand
-from latticebench.methods.engine.dynamics import Factor
+from latticebench.diagnosis.acting.placed import Chain, Force, InStep, Placed, Scene, Summand
 from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     from numpy import ndarray
+
+
+@dataclass(frozen=True)
+class Wave(InStep):
+    """The factor t**power * cos(omega t), or sin(omega t), the same at all sites.
+
+    Attributes:
+        name: "cos" or "sin".
+        omega: angular frequency, one over the unit of time.
+        power: of the time, for derivatives by omega.
+    """
+
+    name: Literal["cos", "sin"]
+    omega: float
+    power: int = 0
+
+    def __call__(self, t: ndarray) -> ndarray:
+        """Return its values (1, B, 1)."""
+        function = np.cos if self.name == "cos" else np.sin
+        return np.asarray((t**self.power * function(self.omega * t))[None, :, None])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,7 +71,7 @@ class Harmonic(Placed, acts="harmonic"):
     @property
     def near(self) -> tuple[object, ...]:
         """The effect and its frequency, to two digits."""
-        return (self.effect.name, f"{self.omega:.2g}")
+        return (*self.place, f"{self.omega:.2g}")
 
     @property
     def frequency(self) -> float:
@@ -67,19 +86,19 @@ class Harmonic(Placed, acts="harmonic"):
         near, far = rules.LINE, rules.AROUND
         return [*alike[max(here - far, 0) : max(here - near, 0)], *alike[here + near : here + far]]
 
-    def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
+    def forces(self, chain: Chain) -> list[Force]:
         """Return the waves and, for the frequency, their derivatives by it."""
-        last, count, found = len(self.strength), len(self.texts), []
+        last, count, share, found = len(self.strength), len(self.texts), self.share(chain), []
         for k, text in enumerate(self.texts):
             a, b = self.strength[k], self.strength[count + k]
             found += [
-                Force(text, a, {k: 1.0}, None, wave(np.cos, self.omega, 0)),
-                Force(text, b, {count + k: 1.0}, None, wave(np.sin, self.omega, 0)),
+                Force(text, a, {k: 1.0}, share, Wave("cos", self.omega)),
+                Force(text, b, {count + k: 1.0}, share, Wave("sin", self.omega)),
             ]
             if a or b:
                 found += [
-                    Force(text, 0.0, {last: -a}, None, wave(np.sin, self.omega, 1)),
-                    Force(text, 0.0, {last: b}, None, wave(np.cos, self.omega, 1)),
+                    Force(text, 0.0, {last: -a}, share, Wave("sin", self.omega, 1)),
+                    Force(text, 0.0, {last: b}, share, Wave("cos", self.omega, 1)),
                 ]
         return found
 
@@ -90,12 +109,3 @@ class Harmonic(Placed, acts="harmonic"):
         phase = sympy.Float(self.omega, 6) * sympy.Symbol("t", real=True)
         bodies = [wave(phase) * Term(text).in_decimals for wave in (sympy.cos, sympy.sin) for text in self.texts]
         return [Summand(*one) for one in zip(self.labels(chain), self.strength, bodies, strict=True)]
-
-
-def wave(function: Callable[[ndarray], ndarray], omega: float, power: int) -> Factor:
-    """Return the factor t**power * function(omega * t), the same at all sites."""
-
-    def factor(t: ndarray) -> ndarray:
-        return np.asarray((t**power * function(omega * t))[None, :, None])
-
-    return factor

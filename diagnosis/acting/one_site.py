@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Force, Placed, Scene, times
 from latticebench.systems.effects import Effect
 
@@ -34,9 +32,8 @@ class OneSite(AtOneSite, acts="one site"):
 
     def forces(self, chain: Chain) -> list[Force]:
         """Return the terms, with a weight of 1 at the site."""
-        here = np.eye(chain.sites)[self.here]
         pairs = zip(self.texts, self.strength, strict=True)
-        return [Force(text, value, {k: 1.0}, here) for k, (text, value) in enumerate(pairs)]
+        return [Force(text, value, {k: 1.0}, self.share(chain)) for k, (text, value) in enumerate(pairs)]
 
     def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
         """Return what the site has."""

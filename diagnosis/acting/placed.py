@@ -127,6 +127,14 @@ class Force:
         return self.factor
 
 
+class InStep(ABC):
+    """A factor of time that is the same at all sites; two with the same numbers are equal."""
+
+    @abstractmethod
+    def __call__(self, t: ndarray) -> ndarray:
+        """Return its values (1, B, 1)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Misreading:
     """What an instrument adds to the readings of a field.
@@ -241,6 +249,10 @@ class Placed(ABC):
         """Return it with another field at earlier times, (B,) -> (parts, B, N) of each recording, where it is fed."""
         return self
 
+    def share(self, chain: Chain) -> Float[ndarray, " sites"] | None:  # noqa: ARG002
+        """Return how much of it each site has (N,); None where all have the whole."""
+        return None
+
     def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return the terms that it adds to the right-hand side."""
         return []
@@ -328,6 +340,10 @@ class AtOneSite(Placed):
     def place(self) -> tuple[object, ...]:
         """The effect and its site."""
         return (self.effect.name, self.here)
+
+    def share(self, chain: Chain) -> Float[ndarray, " sites"]:
+        """Return 1 at the site, 0 elsewhere."""
+        return np.asarray(np.eye(chain.sites)[self.here])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

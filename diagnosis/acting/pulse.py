@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from latticebench.diagnosis import rules
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Placed, Scene, Summand
-from latticebench.methods.engine.dynamics import Factor
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, InStep, Placed, Scene, Summand
 from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
 
@@ -19,6 +18,25 @@ if TYPE_CHECKING:
 
 # Middles that are tried of each width, at most, and the ratio of one width to the next.
 MOST_MIDDLES, WIDER = 60, 3.0
+
+
+@dataclass(frozen=True)
+class Bell(InStep):
+    """The factor x**power * exp(-x^2 / 2) with x = (t - at) / width, the same at all sites.
+
+    Attributes:
+        at, width: in the unit of time.
+        power: of x, for derivatives by middle and width.
+    """
+
+    at: float
+    width: float
+    power: int = 0
+
+    def __call__(self, t: ndarray) -> ndarray:
+        """Return its values (1, B, 1)."""
+        x = (t - self.at) / self.width
+        return np.asarray((x**self.power * np.exp(-(x**2) / 2))[None, :, None])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,11 +61,9 @@ class Pulse(Placed, acts="pulse"):
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return pulses of several widths all over the recording."""
-        texts, width = scene.terms(effect), 1.0 / scene.top
-        while texts and width < scene.span / 6:
-            for at in scene.begin + np.arange(0, scene.span, max(1.5 * width, scene.span / MOST_MIDDLES)):
-                yield cls(effect=effect, texts=texts, at=float(at), width=width, strength=(0.0,) * len(texts))
-            width *= WIDER
+        texts = scene.terms(effect)
+        for at, width in bells(scene) if texts else ():
+            yield cls(effect=effect, texts=texts, at=at, width=width, strength=(0.0,) * len(texts))
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the pulse of each term."""
@@ -57,7 +73,7 @@ class Pulse(Placed, acts="pulse"):
     @property
     def near(self) -> tuple[object, ...]:
         """The effect and its middle, to a width."""
-        return (self.effect.name, f"{self.at / max(abs(self.width), 1e-300):.0f}")
+        return (*self.place, f"{self.at / max(abs(self.width), 1e-300):.0f}")
 
     def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:
         """Return the next pulses of its width, before and after, that hardly overlap with it."""
@@ -71,22 +87,15 @@ class Pulse(Placed, acts="pulse"):
         """Return whether its middle is before a time: later, its strength is not known."""
         return self.at <= t
 
-    def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
+    def forces(self, chain: Chain) -> list[Force]:
         """Return the pulse and, for middle and width, its derivatives by them."""
-        last, found = len(self.strength), []
+        last, share, found = len(self.strength), self.share(chain), []
         for k, (text, a) in enumerate(zip(self.texts, self.strength, strict=True)):
-            found.append(Force(text, a, {k: 1.0}, None, self._factor(0)))
+            found.append(Force(text, a, {k: 1.0}, share, Bell(self.at, self.width)))
             if a:
-                found.append(Force(text, 0.0, {last: a / self.width}, None, self._factor(1)))
-                found.append(Force(text, 0.0, {last + 1: a / self.width}, None, self._factor(2)))
+                found.append(Force(text, 0.0, {last: a / self.width}, share, Bell(self.at, self.width, 1)))
+                found.append(Force(text, 0.0, {last + 1: a / self.width}, share, Bell(self.at, self.width, 2)))
         return found
-
-    def _factor(self, power: int) -> Factor:
-        def factor(t: ndarray) -> ndarray:
-            x = (t - self.at) / self.width
-            return np.asarray((x**power * np.exp(-(x**2) / 2))[None, :, None])
-
-        return factor
 
     def summands(self, chain: Chain) -> list[Summand]:
         """Return the pulse."""
@@ -100,3 +109,12 @@ class Pulse(Placed, acts="pulse"):
         body = sympy.exp(sympy.UnevaluatedExpr(exponent))
         bodies = [body * Term(text).in_decimals for text in self.texts]
         return [Summand(*one) for one in zip(self.labels(chain), self.strength, bodies, strict=True)]
+
+
+def bells(scene: Scene) -> Iterator[tuple[float, float]]:
+    """Return middles and widths of pulses all over the recording, in the unit of time."""
+    width = 1.0 / scene.top
+    while width < scene.span / 6:
+        for at in scene.begin + np.arange(0, scene.span, max(1.5 * width, scene.span / MOST_MIDDLES)):
+            yield float(at), width
+        width *= WIDER

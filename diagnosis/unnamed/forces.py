@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.acting import Chain, Force
-from latticebench.diagnosis.acting.harmonic import wave
+from latticebench.diagnosis.acting.harmonic import Wave
 from latticebench.diagnosis.unnamed.course import Course, courses, growing
 from latticebench.diagnosis.unnamed.nameless import EFFECT, Nameless
 from latticebench.methods.engine.dynamics import Factor
@@ -135,15 +135,13 @@ def beginning(problem: Problem) -> Iterator[Pushed]:
 
 
 def at_sites(problem: Problem) -> Iterator[Pushed]:
-    """Yield what is at single sites: terms, and bonds that both of their sites feel, or one of them alone."""
+    """Yield what is at single sites: terms, and bonds that one of their sites feels alone."""
     chain, sites = problem.chain, np.eye(problem.chain.sites)
     for here in chain.moving if chain.sites > 1 else ():
         for text in _base(problem):
             yield _pushed(chain, text, [text], [sites[here]], here=here)
         if chain.reach and here + 1 in chain.moving:
-            bond = _bond(problem, here)
-            yield _of(chain, f"the bond to site {here + 2}", [bond], here)
-            for site, one in zip((here, here + 1), bond, strict=True):
+            for site, one in zip((here, here + 1), _bond(problem, here), strict=True):
                 yield _of(chain, f"the bond to site {2 * here + 2 - site}, felt by this site alone", [(one,)], site)
 
 
@@ -154,15 +152,12 @@ def _bond(problem: Problem, here: int) -> tuple[Force, Force]:
 
 
 def swinging(problem: Problem) -> Iterator[Pushed]:
-    """Yield what swings at one frequency: forces at single sites, waves along the chain, terms at all sites."""
+    """Yield what swings at one frequency: waves along the chain, terms at all sites."""
     chain, scene = problem.chain, problem.scene
     stride = len(scene.frequencies) // MOST_FREQUENCIES + 1
-    sites = np.eye(chain.sites)
     texts = [text for text in _base(problem) if text not in ("1", "u[n]")]
     for omega in scene.frequencies[::stride]:
-        waves = [wave(function, float(omega), 0) for function in (np.cos, np.sin)]
-        for here in chain.moving if chain.sites > 1 else ():
-            yield _pushed(chain, "a force of its own course in time", ["1"], [sites[here]], waves, here)
+        waves = [Wave("cos", float(omega)), Wave("sin", float(omega))]
         for number in range(1, chain.sites // 2 + 1):
             angle = 2 * np.pi * number / chain.sites
             shapes = [function(angle * np.arange(chain.sites)) for function in (np.cos, np.sin)]

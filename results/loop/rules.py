@@ -42,7 +42,7 @@ NEVER, ALWAYS = 0.0, 1e9
 # What stands for a rule that is switched off, by its number: a value at which it never acts, or always does.
 OFF: Mapping[str, Any] = {
     "FALSE_ALARM": 1.0, "FALSE_DOUBT": NEVER, "NAMED": NEVER, "STAND_IN": NEVER,
-    "FEW_AROUND": ALWAYS, "STRETCHES": 1, "RIVALS": 1, "TRIED": 1, "UNDERSTATED": 1.0,
+    "FEW_AROUND": ALWAYS, "CROWDED": 0.5, "STRETCHES": 1, "RIVALS": 1, "TRIED": 1, "UNDERSTATED": 1.0,
     "MOST_EFFECTS": 100, "EQUAL": NEVER, "PERIODS": NEVER, "FIRST_HORIZON": 1e6, "AT_ONCE": NEVER,
     "FASTER": rules.GROWTH, "ALMOST": 1.0, "BORDER": 1e6, "LOST": ALWAYS, "FOLLOWED": NEVER, "SHARE": NEVER,
     "SHARE_TIMED": NEVER, "REPELLING": NEVER, "WORSE": ALWAYS, "BEYOND_NOISE": NEVER,

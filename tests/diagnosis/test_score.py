@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.diagnosis.fitting import fit
+from latticebench.diagnosis.glance import _duals, _Pull
 from latticebench.diagnosis.horizon import Layout, follow
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
@@ -83,8 +84,12 @@ def test_a_force_at_one_site_is_glanced_at_as_one_at_every_site_is(problem, plai
     """The short way, by what a force's course in time does, agrees with the long one, by the force itself."""
     tangent = Tangent(plain)
     one = nearest_drive(problem)
-    long = tangent._push(0, one).reshape(len(one.numbers), -1) @ tangent._duals[0]
-    np.testing.assert_allclose(tangent._pulled(0, one), long, rtol=1e-9, atol=1e-9 * np.max(np.abs(long)))
+    dual = _duals(tangent)[0]
+    for placed in (one, next(one for one in problem.candidates if one.effect.name == "local-drive")):
+        long = tangent.push(0, placed).reshape(len(placed.numbers), -1) @ dual
+        short = np.zeros_like(long)
+        _Pull(tangent, 0, dual).add([placed], np.array([0, len(long)]), short)
+        np.testing.assert_allclose(short, long, rtol=1e-9, atol=1e-9 * np.max(np.abs(long)))
 
 
 def test_other_ends_have_a_score_as_they_stand(problem, plain):

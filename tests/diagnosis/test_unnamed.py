@@ -103,11 +103,11 @@ def test_an_effect_that_stands_in_for_what_has_no_name_is_doubted():
     assert [(one.name, one.instead) for one in found.left] == [("t*u[n]", ("parametric-drive",))]
 
 
-def test_a_weak_bond_is_found_where_it_is():
-    weak = chain(lambda t, u, v: 0.02 * np.array([0.0, u[1] - u[2], u[2] - u[1], 0.0]))
-    found = diagnosed(weak, ("dry-friction",))
+def test_a_bond_that_one_site_feels_alone_is_found_where_it_is():
+    lopsided = chain(lambda t, u, v: 0.02 * np.array([0.0, u[1] - u[2], 0.0, 0.0]))
+    found = diagnosed(lopsided, ("dry-friction",))
     assert found.verdict == "unexplained"
-    assert (found.left[0].name, found.left[0].site) == ("the bond to site 3", 1)
+    assert (found.left[0].name, found.left[0].site) == ("the bond to site 3, felt by this site alone", 1)
 
 
 def test_readings_that_hold_some_of_their_neighbours_are_found():
@@ -126,6 +126,19 @@ def test_readings_that_hold_some_of_their_neighbours_are_found():
 def test_an_effect_that_is_there_is_not_doubted(name, force):
     found = diagnose(PLAIN, 2, [chain(force)], CATALOGUE)
     assert [one.name for one in found.findings] == [name]
+    assert found.verdict == "explained"
+
+
+@pytest.mark.parametrize(
+    ("name", "force"),
+    [("local-damping", lambda t, u, v: -0.05 * np.eye(len(u))[1] * v),
+     ("local-drive", lambda t, u, v: 0.05 * np.cos(2.6 * t) * np.eye(len(u))[1]),
+     ("local-kick", lambda t, u, v: 0.3 * np.exp(-((t - 12) ** 2) / 2) * np.eye(len(u))[1]),
+     ("bond-defect", lambda t, u, v: 0.05 * np.array([0.0, u[2] - u[1], u[1] - u[2], 0.0]))],
+)  # fmt: skip
+def test_what_acts_at_one_site_or_bond_is_named_where_it_is(name, force):
+    found = diagnose(PLAIN, 2, [chain(force)], CATALOGUE)
+    assert [(one.name, one.site) for one in found.findings] == [(name, 1)]
     assert found.verdict == "explained"
 
 

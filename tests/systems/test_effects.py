@@ -13,8 +13,8 @@ from latticebench.systems.terms import Term
 EXPECTED = """
 damping quadratic-drag dry-friction onsite-linear onsite-quadratic onsite-cubic onsite-quintic constant-force drive
 parametric-drive known-input gradient trap memory kick next-neighbour nonlinear-coupling asymmetric-coupling
-intersite-nonlinearity long-range nonlinear-loss gain-loss defect unequal-masses ends disorder sensor-offset sensor-gain
-sensor-curve sensor-drift clock
+intersite-nonlinearity long-range nonlinear-loss gain-loss defect bond-defect local-damping local-drive local-kick
+unequal-masses ends disorder sensor-offset sensor-gain sensor-curve sensor-drift clock
 """
 LATTICES = [(1, False), (1, True), (2, False), (2, True)]
 

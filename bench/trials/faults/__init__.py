@@ -60,8 +60,6 @@ SECOND_ORDER = (
     "other: wavy-drag",
     "other: lopsided-bonds",
     "other: bent-damper",
-    # For order 1, where a brake would be loss in proportion to u, this is a defect.
-    "other: braked-site",
     # For order 1 this would be disorder, and the next one asymmetric coupling.
     "other: absorbing-ends",
     "other: gyroscopic-bonds",

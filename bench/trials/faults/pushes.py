@@ -117,6 +117,12 @@ def steepening(m: Moment) -> ndarray:
     return np.asarray((cubes.neighbour(1) - cubes.neighbour(-1)) / 2)
 
 
+def loose(m: Moment) -> ndarray:
+    """Return what one bond does to the sites at its ends."""
+    k, each = int(m.drawn.about["bond"]), np.eye(len(m.u))
+    return np.asarray((m.u[k + 1] - m.u[k]) * (each[k] - each[k + 1]))
+
+
 def gyroscopic(m: Moment) -> ndarray:
     """Return half the difference of the neighbours' velocities.
 
@@ -151,6 +157,10 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "nonlinear-loss": lambda m: -(np.abs(m.u) ** 2) * m.u,
     "gain-loss": lambda m: (-1.0) ** np.arange(len(m.u)) * m.u,
     "defect": lambda m: np.eye(len(m.u))[m.drawn.site] * m.u,
+    "bond-defect": loose,
+    "local-damping": lambda m: -np.eye(len(m.u))[m.drawn.site] * m.v,
+    "local-drive": lambda m: m.wave() * np.eye(len(m.u))[m.drawn.site],
+    "local-kick": lambda m: m.pulse() * np.eye(len(m.u))[m.drawn.site],
     "disorder": lambda m: m.drawn.each * m.u,
 }
 
@@ -159,7 +169,6 @@ PLAIN: dict[str, Callable[[Moment], ndarray]] = {
     "other: cubic-drag": lambda m: -(m.v**3),
     "other: friction-between": between,
     "other: drifting-stiffness": lambda m: (m.t - m.drawn.about["middle"]) * m.u,
-    "other: weak-bond": lambda m: m.drawn.bond @ m.u,
     "other: noise-force": lambda m: np.sum(np.cos(m.drawn.omegas * m.t + m.drawn.phases), axis=0),
     "other: saturation": lambda m: m.u / (1 + 4 * np.abs(m.u) ** 2) if m.chain.is_complex else np.cos(3 * m.u),
     "other: wavy-force": lambda m: m.waves(np.abs(m.u)) * (m.u if m.chain.is_complex else 1),
@@ -184,7 +193,6 @@ SECOND_BLIND: dict[str, Callable[[Moment], ndarray]] = {
 
 THIRD_BLIND: dict[str, Callable[[Moment], ndarray]] = {
     "other: pumped-coupling": lambda m: m.wave() * (m.stretch(1) + m.stretch(-1)),
-    "other: shaken-end": lambda m: m.wave() * np.eye(len(m.u))[0],
     "other: three-body": lambda m: m.neighbour(1) * np.conj(m.u) * m.neighbour(-1),
     "other: unsteady-supply": lambda m: m.supply() * m.u,
     "other: bent-damper": lambda m: -(np.abs(m.u) ** 2) * m.v,
@@ -193,8 +201,6 @@ THIRD_BLIND: dict[str, Callable[[Moment], ndarray]] = {
 FOURTH_BLIND: dict[str, Callable[[Moment], ndarray]] = {
     "other: uneven-floor": lambda m: m.drawn.each,
     "other: sweeping-drive": lambda m: m.sweep() * np.ones(len(m.u)),
-    "other: braked-site": lambda m: -np.eye(len(m.u))[m.drawn.site] * m.v,
-    "other: tapped-site": lambda m: m.pulse() * np.eye(len(m.u))[m.drawn.site],
     "other: one-way-bond": lambda m: np.eye(len(m.u))[m.drawn.site] * m.stretch(1),
     "other: self-steepening": steepening,
 }

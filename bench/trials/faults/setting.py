@@ -28,7 +28,7 @@ class Drawn:
     """What is drawn for a recording, whether its effect needs it or not.
 
     Single numbers, all dimensionless:
-        site: (0, ..., N-1); middle: of the record.
+        site: (0, ..., N-1); bond: the site to the left of one; middle: of the record.
         omega, phase: frequency and phase of a drive; sweep: by how much its frequency rises per unit of time.
         at, width: middle and width of a pulse; ticking: time between two ticks.
         delay: of a memory.
@@ -47,7 +47,6 @@ class Drawn:
         about: those numbers by their names.
         n: place of each site, counted from the chain's middle (N,).
         far: long-range coupling of the sites (N, N).
-        bond: one bond's force (N, N).
         bonds: the forces of bonds that are all different (N, N).
         shape: wave numbers and phases of a drawn function (2, 3).
         each: a number for each site (N,).
@@ -66,7 +65,6 @@ class Drawn:
     about: Mapping[str, float]
     n: Float[ndarray, " sites"]
     far: Float[ndarray, "sites sites"]
-    bond: Float[ndarray, "sites sites"]
     bonds: Float[ndarray, "sites sites"]
     shape: Float[ndarray, "two waves"]
     each: Float[ndarray, " sites"]
@@ -201,8 +199,6 @@ def _first_numbers(
     distance = np.abs(n[:, None] - n)
     far = np.where(distance >= 2, np.maximum(distance, 1.0) ** -power, 0.0)
     k = int(draw.integers(sites // 3, 2 * sites // 3))
-    bond = np.zeros((sites, sites))
-    bond[k : k + 2, k : k + 2] = [[-1, 1], [1, -1]]
     omegas = draw.uniform(2 * np.pi / span, 6.0, size=(5, sites))
     phases = draw.uniform(0, 2 * np.pi, size=(5, sites))
     about = {
@@ -213,6 +209,7 @@ def _first_numbers(
         "width": span * draw.uniform(0.02, 0.06),
         "s": power,
         "middle": float(np.mean(times)),
+        "bond": k,
     }
     each = draw.normal(size=sites)
     about["delay"] = span * draw.uniform(0.08, 0.2)
@@ -226,7 +223,7 @@ def _first_numbers(
     bonds -= np.diag(bonds.sum(axis=1))
     shape = np.stack([draw.uniform(1.0, 5.0, size=3), draw.uniform(0, 2 * np.pi, size=3)])
     return about, {
-        "n": n, "far": far - np.diag(far.sum(axis=1)), "bond": bond, "bonds": bonds, "shape": shape, "each": each,
+        "n": n, "far": far - np.diag(far.sum(axis=1)), "bonds": bonds, "shape": shape, "each": each,
         "omegas": omegas, "phases": phases, "force": force,
     }  # fmt: skip
 

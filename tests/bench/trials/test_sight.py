@@ -43,7 +43,7 @@ def test_what_others_leave_of_a_change_is_its_distance_from_their_span() -> None
 
 def test_the_size_of_a_large_effect_is_what_the_best_fit_of_the_declared_equation_leaves() -> None:
     setting, _, sight = scene("phi4")
-    u, v = FAULTS["other: weak-bond"].fields(setting, 0.2)
+    u, v = FAULTS["bond-defect"].fields(setting, 0.2)
     assert v is not None
     seen = np.concatenate([u, v], axis=1)
 
@@ -64,7 +64,7 @@ def test_the_size_of_a_large_effect_is_what_the_best_fit_of_the_declared_equatio
 @pytest.mark.parametrize("name", ["phi4", "dnls"])
 def test_to_first_order_a_small_effect_has_the_size_of_a_fit(name: str) -> None:
     setting, _, sight = scene(name)
-    fields = FAULTS["other: weak-bond"].fields(setting, 1e-3)
+    fields = FAULTS["bond-defect"].fields(setting, 1e-3)
     assert sight.size(fields) == pytest.approx(sight.fitted(fields).size, rel=0.02)
     assert sight.size(fields) > 0
 
@@ -87,7 +87,7 @@ def test_an_effect_of_the_catalogue_leaves_nothing_of_itself(name: str, effect: 
 
 def test_what_no_effect_of_the_catalogue_does_is_apart_from_it() -> None:
     setting, _, sight = scene("phi4")
-    line = sight.fitted(FAULTS["other: weak-bond"].fields(setting, 0.1))
+    line = sight.fitted(FAULTS["other: uneven-bonds"].fields(setting, 0.1))
     assert sight.apart(line) > 0.5 * line.size
 
 

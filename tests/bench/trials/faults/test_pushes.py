@@ -55,10 +55,10 @@ def truth_of(name):
 @pytest.mark.parametrize(
     "effect",
     [
-        "damping", "drive", "defect", "next-neighbour", "unequal-masses", "gradient", "other: lopsided-bonds",
-        "other: moving-spot",
-        "other: plane-wave", "other: stray-wire", "other: pumped-coupling", "other: shaken-end", "other: three-body",
-        "other: bent-damper", "other: end-stops", "other: sweeping-drive", "other: braked-site", "other: tapped-site",
+        "damping", "drive", "defect", "bond-defect", "next-neighbour", "unequal-masses", "gradient",
+        "other: lopsided-bonds", "other: moving-spot",
+        "other: plane-wave", "other: stray-wire", "other: pumped-coupling", "local-drive", "other: three-body",
+        "other: bent-damper", "other: end-stops", "other: sweeping-drive", "local-damping", "local-kick",
         "other: one-way-bond", "other: self-steepening", "other: absorbing-ends", "other: gyroscopic-bonds",
         "other: shared-load",
         "other: ticking-pump",
@@ -72,6 +72,7 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
     at = np.eye(7)[int(about["site"])]
     left, right = int(about["wire_from"]), int(about["wire_to"])
     assert right - left > 1
+    loose = int(about["bond"])
 
     def own(u):
         return xi[0] * (neighbours(u) - 2 * u) + xi[1] * u + xi[2] * u**3
@@ -95,13 +96,14 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
         "other: plane-wave": lambda t, _u, _v: np.cos(about["wave_number"] * n - about["omega"] * t + about["phase"]),
         "other: stray-wire": lambda _t, u, _v: (u[right] - u[left]) * (np.eye(7)[left] - np.eye(7)[right]),
         "other: pumped-coupling": lambda t, u, _v: wave(t) * (neighbours(u) - 2 * u),
-        "other: shaken-end": lambda t, _u, _v: wave(t) * (n == -3),
+        "local-drive": lambda t, _u, _v: wave(t) * at,
         "other: three-body": lambda _t, u, _v: np.append(u[1:], u[-1]) * u * np.append(u[0], u[:-1]),
         "other: bent-damper": lambda _t, u, v: -(u**2) * v,
         "other: end-stops": lambda _t, u, _v: -(u - np.clip(u, begin - about["play"], begin + about["play"])),
         "other: sweeping-drive": lambda t, u, _v: rising(about, t) + 0 * u,
-        "other: braked-site": lambda _t, _u, v: -at * v,
-        "other: tapped-site": lambda t, _u, _v: at * np.exp(-0.5 * ((t - about["at"]) / about["width"]) ** 2),
+        "local-damping": lambda _t, _u, v: -at * v,
+        "bond-defect": lambda _t, u, _v: (u[loose + 1] - u[loose]) * (np.eye(7)[loose] - np.eye(7)[loose + 1]),
+        "local-kick": lambda t, _u, _v: at * np.exp(-0.5 * ((t - about["at"]) / about["width"]) ** 2),
         "other: one-way-bond": lambda _t, u, _v: at * np.diff(u, append=u[-1]),
         "other: self-steepening": lambda _t, u, _v: (np.append(u[1:], u[-1]) ** 3 - np.append(u[0], u[:-1]) ** 3) / 2,
         "other: absorbing-ends": lambda _t, _u, v: -np.exp(-np.array([0, 1, 2, 3, 2, 1, 0]) / about["breadth"]) * v,
@@ -133,7 +135,7 @@ OF_COMPLEX_FIELDS = [
         for effect, turn in [
             ("other: plane-wave", 1), ("other: stray-wire", 1), ("other: pumped-coupling", 1),
             ("other: three-body", 1), ("other: end-stops", -1), ("other: sweeping-drive", 1),
-            ("other: tapped-site", 1), ("other: one-way-bond", 1), ("other: self-steepening", 1),
+            ("local-kick", 1), ("other: one-way-bond", 1), ("other: self-steepening", 1),
             ("other: shared-load", -1), ("other: ticking-pump", 1),
         ]
     ),
@@ -167,7 +169,7 @@ def test_a_complex_motion_is_that_of_an_equation_written_by_hand(effect, turn):
             np.exp(1j * np.angle(u - begin)) * np.maximum(abs(u - begin) - about["play"], 0)
         ),
         "other: sweeping-drive": lambda t, _: rising(about, t),
-        "other: tapped-site": lambda t, _: at * np.exp(-0.5 * ((t - about["at"]) / about["width"]) ** 2),
+        "local-kick": lambda t, _: at * np.exp(-0.5 * ((t - about["at"]) / about["width"]) ** 2),
         "other: one-way-bond": lambda _, u: at * np.diff(u, append=u[-1]),
         "other: self-steepening": lambda _, u: np.convolve(
             np.pad(u * u * u.conj(), 1, "edge"), [0.5, 0, -0.5], "valid"

@@ -1,0 +1,32 @@
+"""A term that swings at a frequency of its own, at one site: an end that is shaken, a site beside a loudspeaker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from latticebench.diagnosis.acting.harmonic import Harmonic
+from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Placed, Scene, Summand, times
+from latticebench.systems.effects import Effect
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HarmonicAtSite(AtOneSite, Harmonic, acts="harmonic at one site"):
+    """A term times a cos(omega t) + b sin(omega t) at one site, nothing elsewhere."""
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return every frequency of the scene at every site that has an equation, on a chain of at least two."""
+        texts = scene.terms(effect)
+        for site in scene.chain.moving if texts and scene.chain.sites > 1 else ():
+            for omega in scene.frequencies:
+                yield cls(effect=effect, texts=texts, omega=float(omega), strength=(0.0,) * (2 * len(texts)), here=site)
+
+    def summands(self, chain: Chain) -> list[Summand]:  # noqa: ARG002
+        """Return nothing: it is no term of every site."""
+        return []
+
+    def sentences(self, chain: Chain) -> list[str]:
+        """Return what drives the site."""
+        sum_ = " + ".join(times(value, text) for text, value in zip(self.labels(chain), self.strength, strict=True))
+        return [f"site {self.here + 1} alone has {sum_} besides"]

@@ -1,0 +1,126 @@
+"""About how many nats forces would win, thousands of them at once.
+
+The slope of the likelihood by a force follows from its adjoint along the motion. Its curvature is a mean square over
+random directions in the space of readings (Hutchinson, Commun. Stat. Simul. Comput. 18, 1059 (1989)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.diagnosis.acting import Force, InStep, Placed
+from latticebench.diagnosis.fitting import by_pieces
+from latticebench.diagnosis.propagation import propagate
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+    from latticebench.diagnosis.score import Tangent
+
+# Random directions of readings that a force's curvature is estimated from, and directions of its numbers that are one.
+DIRECTIONS, ALIKE = 24, 1e-3
+# Seed of the directions: the same each time, so that a diagnosis is.
+SIGNS = 0
+
+
+def glanced(tangent: Tangent, candidates: Sequence[Placed]) -> list[float]:
+    """Return about how many nats forces would win, without what each of them would do to the readings."""
+    ends = np.cumsum([0, *map(columns_of, candidates)])
+    by = np.zeros((ends[-1], 1 + DIRECTIONS))
+    for number, dual in enumerate(_duals(tangent)):
+        _Pull(tangent, number, dual).add(candidates, ends, by)
+    # What overflows along the motion wins nothing.
+    by = np.where(np.isfinite(by), by, 0.0)
+    size = np.linalg.norm(by[:, 1:], axis=1, keepdims=True)
+    by /= np.where(size > 0, size, 1.0)
+    won, count = np.zeros(len(candidates)), np.diff(ends)
+    for columns in np.unique(count):
+        alike = np.flatnonzero(count == columns)
+        block = by[ends[alike][:, None] + np.arange(columns)]
+        u, values, _ = np.linalg.svd(block[:, :, 1:], full_matrices=False)
+        slopes = np.einsum("cnk,cn->ck", u, block[:, :, 0])
+        held = values > ALIKE
+        won[alike] = DIRECTIONS * np.sum(np.where(held, slopes / np.where(held, values, 1.0), 0.0) ** 2, axis=1)
+    return [tangent.gain(float(one)) for one in won]
+
+
+def columns_of(one: Placed) -> int:
+    """Return how many columns an effect has: one per number, or one for what it does without any."""
+    return max(len(one.numbers), 1)
+
+
+class _Pull:
+    """Derivatives of what one recording leaves, and of random directions, by the numbers of effects."""
+
+    def __init__(self, tangent: Tangent, number: int, dual: ndarray) -> None:
+        self.tangent, self.number, self.dual = tangent, number, dual
+        self.t, self.chain = tangent.along[number].t, tangent.fitted.chain
+        self.courses: dict[InStep | None, ndarray] = {}
+
+    def add(self, candidates: Sequence[Placed], ends: ndarray, by: ndarray) -> None:
+        """Add those of all effects to their rows (numbers, 1 + D).
+
+        Forces that are one course in time at the same sites are taken together.
+        """
+        together: dict[tuple[str, bytes], list[tuple[Force, InStep | None, int]]] = {}
+        for one, begin, end in zip(candidates, ends, ends[1:], strict=False):
+            forces = [(force, force.factor) for force in one.forces(self.chain)]
+            in_step = [(force, factor, begin) for force, factor in forces if isinstance(factor, InStep | None)]
+            if one.scaled() is not None or one.other_ends() is not None or len(in_step) < len(forces):
+                by[begin:end] += self.tangent.push(self.number, one).reshape(end - begin, -1) @ self.dual
+                continue
+            for each in in_step:
+                weights = b"" if each[0].weights is None else each[0].weights.tobytes()
+                together.setdefault((each[0].text, weights), []).append(each)
+        for same in together.values():
+            courses = np.stack([self._course(factor) for _, factor, _ in same])
+            pulled = courses @ self._in_time(same[0][0])
+            for (force, _, begin), value in zip(same, pulled, strict=True):
+                for k, share in force.by.items():
+                    by[begin + k] += share * value
+
+    def _course(self, factor: InStep | None) -> ndarray:
+        """Return a factor that is the same at all sites, at each time: (rows,)."""
+        if factor not in self.courses:
+            self.courses[factor] = np.ones(len(self.t)) if factor is None else factor(self.t)[0, :, 0]
+        return self.courses[factor]
+
+    def _in_time(self, force: Force) -> ndarray:
+        """Return derivatives by a force's factor at each time: (rows, 1 + D)."""
+        values = self.tangent.term(self.number, force.text)
+        if force.weights is not None:
+            values = values * force.weights[list(self.chain.moving)]
+        return np.asarray(np.einsum("rqn,rqnk->rk", values, self.dual.reshape(*values.shape, -1), optimize=True))
+
+
+def _duals(tangent: Tangent) -> list[ndarray]:
+    """Return derivatives of what is left, and of random directions, by forces in each recording: (rows parts M, .)."""
+    layout, shape = tangent.fitted.layout, tangent.error.shape
+    signs = np.random.default_rng(SIGNS).choice([-1.0, 1.0], (*shape, DIRECTIONS))
+    looked = np.concatenate([tangent.left[:, None], tangent.new(by_pieces(layout, signs))], axis=1)
+    readings = tangent.whitener.transposed(looked.reshape(*shape, -1) * tangent.robust[..., None])
+    found, begin = [], 0
+    for number, rows in enumerate(layout.rows):
+        part = readings[begin : begin + rows.size] * tangent.own(number)[..., None]
+        begin += rows.size
+        found.append(_dual(tangent, number, part))
+    return found
+
+
+def _dual(tangent: Tangent, number: int, readings: ndarray) -> ndarray:
+    """Return derivatives by forces from those by the readings' fields (rows, channels, 1 + D)."""
+    layout, along, chain = tangent.fitted.layout, tangent.along[number], tangent.fitted.chain
+    (pieces, m), count = layout.rows[number].shape, readings.shape[-1]
+    fields = readings.reshape(pieces, m, chain.levels, chain.parts, chain.sites, count)[..., layout.plain.moving, :]
+    by_state = np.zeros((pieces, m, count, chain.order, *fields.shape[3:5]))
+    by_state[:, :, :, : chain.levels] = np.moveaxis(fields, -1, 2)
+    by_state = by_state.reshape(pieces, m, count, -1)
+    back = np.swapaxes(tangent.followed.transitions[number][:, ::-1], 2, 3)
+    carried = propagate(back, by_state[:, -2::-1], by_state[:, -1])[:, ::-1]
+    dual = np.zeros((pieces, m, chain.parts, len(chain.moving), count))
+    dual[:, :-1] += np.einsum("pjqns,pjks->pjqnk", along.early, carried[:, 1:], optimize=True)
+    dual[:, 1:] += np.einsum("pjqns,pjks->pjqnk", along.late, carried[:, 1:], optimize=True)
+    return dual.reshape(-1, count)
