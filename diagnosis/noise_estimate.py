@@ -242,6 +242,7 @@ class _Task:
     def packed(self, noise: Noise, structure: Structure) -> Float[ndarray, " numbers"]:
         """Return noise as numbers to vary: log sizes, log growth, 1 / nu, correlations over the typical interval.
 
+        Sizes are those of what is new in a reading, which has a floor: size * sqrt(1 - correlation^2).
         Parts of the structure that the noise does not have get a start of their own; with growth, half of the variance.
         """
         size = noise.size if noise.structure.own_sizes or not structure.own_sizes else self.plain(structure).size
@@ -262,7 +263,9 @@ class _Task:
         if structure.memory:
             time = noise.memory if structure.own_sizes else np.mean(noise.memory, keepdims=True)
             time = np.where(time > 0, time, self.interval)
-            numbers.append(np.clip(np.exp(-self.interval / time), LEAST_CORRELATED, MOST_CORRELATED))
+            rho = np.clip(np.exp(-self.interval / time), LEAST_CORRELATED, MOST_CORRELATED)
+            size = np.maximum(size * np.sqrt(1 - rho**2), self.floor)
+            numbers.append(rho)
         return np.concatenate([np.log(size), *numbers])
 
     def unpacked(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> Noise:
@@ -275,10 +278,11 @@ class _Task:
     def parts(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> tuple[ndarray, float, float, ndarray]:
         """Return sizes, growth, degrees of freedom and correlations over the typical interval."""
         groups = self.groups(structure)[1]
-        size, rest = np.exp(numbers[:groups]), list(numbers[groups:])
+        new, rest = np.exp(numbers[:groups]), list(numbers[groups:])
         growth = float(np.exp(rest.pop(0))) if structure.growth else 0.0
         tail = float(1 / rest.pop(0)) if structure.tails else np.inf
-        return size, growth, tail, np.array(rest) if structure.memory else np.zeros(groups)
+        rho = np.array(rest) if structure.memory else np.zeros(groups)
+        return new / np.sqrt(1 - rho**2), growth, tail, rho
 
     def cost(self, numbers: Float[ndarray, " count"], structure: Structure) -> tuple[float, Float[ndarray, " count"]]:
         """Return minus the mean log likelihood of a reading, and its gradient."""
@@ -308,7 +312,7 @@ class _Task:
         if structure.memory:
             by_rho = slope * (rho * q * z - before) * q - rho * q**2
             by_near = by_rho * rho * np.where(self.linked, self.gap, 0.0) / near[group]
-            gradient.append(np.bincount(group, by_near, minlength=groups))
+            gradient.append(np.bincount(group, by_near, minlength=groups) + gradient[0] * near / (1 - near**2))
         return float(cost) / len(y), np.concatenate(gradient) / len(y)
 
 

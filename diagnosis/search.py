@@ -99,12 +99,13 @@ class Search:
             settled = last is not None and last.models[0].model.key == best[0].model.key
             last = Found(before, tuple(best), done)
             yield last
-            length = self._next(length, settled)
+            further = self._further(length, settled)
             followed = [one for one in (before, *best) if one.longest == best[0].longest]
-            if not length and (finer := without_rounding(self.problem, followed, self.value)) is not None:
-                self.problem, length = finer, self._longest
+            if not further and (finer := without_rounding(self.problem, followed, self.value)) is not None:
+                self.problem, further = finer, [self._longest]
                 self.say("taking away what rounding adds to the readings")
-            carried = self._carried(last, length) if length else []
+            each = ((self._carried(last, one), one) for one in further)
+            carried, length = next((pair for pair in each if pair[0]), ([], 0))
 
     def _at_once(self, first: list[Fitted]) -> list[Fitted]:
         """Return the first fits on the longest pieces if the declared equation alone nearly follows these.
@@ -146,13 +147,13 @@ class Search:
         room = int(np.sqrt(MOST_MOVES / (MOST * len(plain.border) * plain.parts * plain.size)))
         return min(longest, max(min(round(rules.BORDER * period), room), self._least))
 
-    def _next(self, length: int, settled: bool) -> int:
-        """Return the rows of the pieces of the next horizon; 0 after the longest."""
+    def _further(self, length: int, settled: bool) -> list[int]:
+        """Return the rows of the pieces of the next horizon, and shorter ones in case these cannot be followed."""
         longest = self._longest
         if length >= longest:
-            return 0
-        further = length * (rules.FASTER if settled else rules.GROWTH)
-        return further if further < rules.ALMOST * longest else longest
+            return []
+        further = [length * many for many in ((rules.FASTER, rules.GROWTH) if settled else (rules.GROWTH,))]
+        return list(dict.fromkeys(one if one < rules.ALMOST * longest else longest for one in further))
 
     def layout(self, length: int, problem: Problem | None = None) -> Layout:
         """Return pieces of a length: of all rows on long horizons, of some on short ones."""
