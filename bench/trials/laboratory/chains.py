@@ -107,13 +107,18 @@ class Chain:
             "damping": lambda v: v,
             "quadratic-drag": lambda v: np.abs(v) * v,
             "dry-friction": lambda v: np.tanh(v / thin),
+            **{
+                f"local-damping@{k}": lambda v, row=row: v * row  # type: ignore[misc]
+                for k, row in enumerate(np.eye(self.sites))
+            },
         }
 
     @functools.cached_property
     def forces(self) -> Mapping[str, Callable[[ndarray], ndarray]]:
         """Each other force as a function of u (copies, N): declared terms by their texts, others by their effects.
 
-        Those at one site (0, ..., N-1) are called "defect@0" and so on.
+        Those at one site (0, ..., N-1) are called "defect@0" and so on, that at the bond from it to the next
+        "bond-defect@0".
         """
         eye = self.shifts[0]
         near = self.shifts[1] + self.shifts[-1] - 2 * eye
@@ -137,6 +142,10 @@ class Chain:
             "gradient": lambda u: n + 0 * u,
             "trap": lambda u: n**2 * u,
             **{f"defect@{k}": lambda u, row=row: u * row for k, row in enumerate(eye)},  # type: ignore[misc]
+            **{
+                f"bond-defect@{k}": lambda u, k=k: (u[:, k + 1] - u[:, k])[:, None] * (eye[k] - eye[k + 1])  # type: ignore[misc]
+                for k in range(self.sites - 1)
+            },
         }
 
     def rate(self, t: float, u: ndarray, v: ndarray, of: Parameters) -> ndarray:
@@ -147,7 +156,8 @@ class Chain:
             u: positions (copies, N).
             v: velocities (copies, N).
             of: parameters by name, one per copy: coefficients by the name of their force, "drive.cos", "drive.sin" and
-                "drive.omega", and "unequal-masses@0", by which the whole right-hand side of a site is scaled beyond 1.
+                "drive.omega", those of a drive at one site with "@0" at the end, and "unequal-masses@0", by which the
+                whole right-hand side of a site is scaled beyond 1.
         """
         total = np.zeros_like(u)
         masses = []
@@ -158,9 +168,10 @@ class Chain:
                 total += value * self.frictions[name](v)
             elif name.startswith("unequal-masses"):
                 masses.append((int(name.partition("@")[2]), value))
-        if "drive.cos" in of:
-            angle = of["drive.omega"] * t
-            total += of["drive.cos"] * np.cos(angle) + of["drive.sin"] * np.sin(angle)
+        for end in {name.removeprefix("drive.cos") for name in of if name.startswith("drive.cos")}:
+            angle = of[f"drive.omega{end}"] * t
+            force = of[f"drive.cos{end}"] * np.cos(angle) + of[f"drive.sin{end}"] * np.sin(angle)
+            total[:, slice(None) if not end else [int(end[1:])]] += force
         for site, value in masses:
             total[:, site] *= 1 + value[:, 0]
         return total

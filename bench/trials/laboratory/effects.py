@@ -1,13 +1,13 @@
 """What is put into a chain or its sensors: which effects make sense there, how large they may be, and their parameters.
 
 Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
-"cos", "sin" and "omega" (of a drive), "offset_2" and "gain_2" (of the second sensor, which reads gain * u + offset),
-and "curve" (c in u + c u^2).
+"cos", "sin" and "omega" (of a drive, at all sites or at one), "offset_2" and "gain_2" (of the second sensor, which
+reads gain * u + offset), and "curve" (c in u + c u^2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 OFFSET, GAIN, CURVE, DRIVE, MASSES = "sensor-offset", "sensor-gain", "sensor-curve", "drive", "unequal-masses"
 TAKING = ("damping", "quadratic-drag", "dry-friction")
 AT_ONE_SITE = ("defect", MASSES)
+# At one site or bond, too; put in where they are asked for.
+LOCAL_DRIVE, LOCAL_DAMPING, BOND = "local-drive", "local-damping", "bond-defect"
+LOCAL = (LOCAL_DRIVE, LOCAL_DAMPING, BOND)
 COUPLED = ("nonlinear-coupling", "asymmetric-coupling")
 MOST_EFFECTS = 5
 # What is asked for instead of names.
@@ -66,11 +69,11 @@ class Ingredient:
 
     def key(self, parameter: str) -> str:
         """Return the name of one of its parameters among all of a chain's, see `Chain.rate`."""
-        if self.name == DRIVE:
-            return f"drive.{parameter}"
+        if self.name in (DRIVE, LOCAL_DRIVE):
+            return f"drive.{parameter}" + ("" if self.site is None else f"@{self.site}")
         if self.name == "disorder":
             return f"defect@{int(parameter.partition('_')[2]) - 1}"
-        if self.name in AT_ONE_SITE:
+        if self.name in (*AT_ONE_SITE, LOCAL_DAMPING, BOND):
             return f"{self.name}@{self.site}"
         return self.name if parameter == "coefficient" else parameter
 
@@ -89,19 +92,22 @@ class Ingredient:
         return {name: value + name.startswith("gain") for name, value in self.values(amount).items()}
 
 
-def sensible(chain: Chain, reach: int) -> list[str]:
+def sensible(chain: Chain, reach: int, names: Sequence[str] = NAMES) -> list[str]:
     """Return the effects that have a meaning in a chain.
 
     Args:
         chain: which.
         reach: sites at either end that are only read; more than 0 where the ends are unknown.
+        names: of the effects that may be.
     """
     inner = chain.sites - 2 * reach
     found = []
-    for name in NAMES:
+    for name in names:
         if DECLARED.get(name) in chain.declared:
             continue
-        if name in (GAIN, *AT_ONE_SITE) and inner < 2:
+        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING) and inner < 2:
+            continue
+        if name == BOND and not (chain.coupled and inner > 2):
             continue
         if name in COUPLED and not (chain.coupled and chain.sites >= 2):
             continue
@@ -121,18 +127,18 @@ def draw_ingredient(name: str, chain: Chain, reach: int, draw: np.random.Generat
         draw: for place, sign and direction.
     """
     inner = np.arange(reach, chain.sites - reach)
-    site = int(draw.choice(inner))
-    sign = -1.0 if name in TAKING else float(draw.choice([-1.0, 1.0]))
+    site = int(draw.choice(inner[:-1] if name == BOND else inner))
+    sign = -1.0 if name in (*TAKING, LOCAL_DAMPING) else float(draw.choice([-1.0, 1.0]))
     if name == OFFSET:
         return _offset(chain, inner, draw)
     if name == GAIN:
         return _gain(chain, inner, draw)
-    if name == DRIVE:
+    if name in (DRIVE, LOCAL_DRIVE):
         phase = draw.uniform(0, 2 * np.pi)
         force = chain.slow**2 * chain.size
         omega = np.exp(draw.uniform(np.log(0.3 * chain.slow), np.log(1.3 * chain.fast)))
         waves = {"cos": force * np.cos(phase), "sin": force * np.sin(phase)}
-        return Ingredient(name, None, waves, 0.5, {"omega": float(omega)})
+        return Ingredient(name, site if name == LOCAL_DRIVE else None, waves, 0.5, {"omega": float(omega)})
     return ingredient(name, chain, site, sign)
 
 
@@ -145,16 +151,17 @@ def ingredient(name: str, chain: Chain, site: int, sign: float = 1.0) -> Ingredi
     if name == MASSES:
         return Ingredient(name, site, {"scale": sign}, 0.9 if sign > 0 else 0.45, {})
     unit, most = _unit(name, chain)
-    return Ingredient(name, site if name == "defect" else None, {"coefficient": sign * unit}, most, {})
+    placed = name in ("defect", LOCAL_DAMPING, BOND)
+    return Ingredient(name, site if placed else None, {"coefficient": sign * unit}, most, {})
 
 
 def candidates(chain: Chain, reach: int) -> list[Ingredient]:
     """Return what might be there instead of an effect: each effect at each place, and three that are never put in."""
     inner = range(reach, chain.sites - reach)
     found = [Ingredient(OFFSET, None, {f"offset_{k + 1}": chain.size for k in range(chain.sites)}, 1.0, {})]
-    for name in sensible(chain, reach):
+    for name in sensible(chain, reach, (*NAMES, LOCAL_DAMPING, BOND)):
         if name not in (OFFSET, DRIVE):
-            places = inner if name in (GAIN, *AT_ONE_SITE) else inner[:1]
+            places = inner if name in (GAIN, *AT_ONE_SITE, LOCAL_DAMPING) else inner[:-1] if name == BOND else inner[:1]
             found += [ingredient(name, chain, site) for site in places]
     if len(inner) > 1:
         found += [ingredient("gradient", chain, 0), ingredient("trap", chain, 0)]
@@ -167,6 +174,8 @@ def _unit(name: str, chain: Chain) -> tuple[float, float]:
     slow, size, span, coupling = chain.slow, chain.size, chain.span, chain.coupling
     return {
         "damping": (1 / span, 4.0),
+        "local-damping": (1 / span, 6.0),
+        "bond-defect": (coupling, 0.5),
         "quadratic-drag": (1 / (slow * size * span), 5.0),
         "dry-friction": (size * slow / span, 0.8),
         "onsite-linear": (slow**2, 0.4),

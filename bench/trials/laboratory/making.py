@@ -21,7 +21,9 @@ import numpy as np
 
 from latticebench.bench.trials.laboratory.chains import Chain, draw_chain
 from latticebench.bench.trials.laboratory.effects import (
+    LOCAL,
     MOST_EFFECTS,
+    NAMES,
     OFTEN,
     Ingredient,
     candidates,
@@ -185,13 +187,13 @@ def _reach(chain: Chain, told: Ends) -> int:
 def _chosen(experiment: Experiment, wanted: _Wanted, draw: np.random.Generator) -> list[Ingredient] | None:
     """Return effects that the recording can tell apart, to first order; None where there are too few of them."""
     chain, reach = experiment.chain, experiment.reach
-    possible = sensible(chain, reach)
     if wanted.effects is not None:
-        if not set(wanted.effects) <= set(possible):
+        if not set(wanted.effects) <= set(sensible(chain, reach, (*NAMES, *LOCAL))):
             return None
         return [draw_ingredient(name, chain, reach, draw) for name in wanted.effects]
     if wanted.count == 0:
         return []
+    possible = sensible(chain, reach)
     weights = np.array([OFTEN.get(name, 1.0) for name in possible])
     order = draw.choice(len(possible), size=len(possible), replace=False, p=weights / weights.sum())
     pool = [draw_ingredient(possible[k], chain, reach, draw) for k in order[: wanted.count + SPARE]]

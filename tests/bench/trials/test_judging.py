@@ -229,6 +229,7 @@ def test_the_suite_has_a_thousand_recordings_and_what_is_held_out_in_blocks_of_i
     assert len(parts["nothing missing"]) == 8 * 250
     assert {case.instrument for case in parts["held-out instruments"]} == {"drifting-zero", "jittered-gaps"}
     assert len({case.effects for case in parts["held-out combinations"]}) == 2
+    assert len(parts["at one site or bond"]) == 5 * 50
     assert all(case.seed >= 20_000 for case in cases)
 
 

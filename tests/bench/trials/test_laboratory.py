@@ -116,6 +116,33 @@ def test_a_recording_moves_by_the_formulas_of_its_effects_in_the_catalogue(names
     np.testing.assert_allclose(motion.unpack(exact.y)[0], one.clean[rows], rtol=0, atol=1e-6 * one.chain.size)
 
 
+@pytest.mark.parametrize("names", [["local-drive", "local-damping", "bond-defect"]])
+def test_what_acts_at_one_site_or_bond_is_what_an_equation_written_by_hand_says(names: list[str]) -> None:
+    one = next(
+        found
+        for seed in range(1, 50)
+        if (found := make_recording(seed, "white", names, sites=4)).declared.texts == LINEAR
+        and found.chain.ends == "free"
+    )
+    (drive, damper, bond), each, (coupling, own) = one.effects, np.eye(4), one.coefficients
+    assert None not in (drive.site, damper.site, bond.site)
+    wave, spring = drive.parameters, each[bond.site] - each[bond.site + 1]
+
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        u, v = y[:4], y[4:]
+        force = coupling * np.diff(np.diff(u, prepend=u[0], append=u[-1])) + own * u
+        angle = wave["omega"] * t
+        force += each[drive.site] * (wave["cos"] * np.cos(angle) + wave["sin"] * np.sin(angle))
+        force += each[damper.site] * damper.parameters["coefficient"] * v
+        return np.concatenate([v, force - bond.parameters["coefficient"] * spring * (spring @ u)])
+
+    times, start = one.samples.t[:60], one.chain.start.ravel()
+    exact = scipy.integrate.solve_ivp(
+        rate, (0.0, times[-1]), start, t_eval=times, method="DOP853", rtol=1e-10, atol=1e-10 * one.chain.size
+    )
+    np.testing.assert_allclose(exact.y[:4].T, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
+
+
 def test_what_is_drawn_is_within_its_bounds() -> None:
     for seed in (1, 2, 3):
         one = make_recording(seed, sites=2)
