@@ -6,20 +6,23 @@ random directions in the space of readings (Hutchinson, Commun. Stat. Simul. Com
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import betaincinv, gammaincinv
 
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Force, InStep, Placed
 from latticebench.diagnosis.fitting import by_pieces
 from latticebench.diagnosis.propagation import propagate
+from latticebench.diagnosis.score import Tangent, columns_of
 
 if TYPE_CHECKING:
     from numpy import ndarray
 
-    from latticebench.diagnosis.score import Tangent
-
+# Candidates of a kind whose score is computed in full.
+PROMISING = 12
 # Random directions of readings that a force's curvature is estimated from, and directions of its numbers that are one.
 DIRECTIONS, ALIKE = 24, 1e-3
 # Seed of the directions: the same each time, so that a diagnosis is.
@@ -47,9 +50,28 @@ def glanced(tangent: Tangent, candidates: Sequence[Placed]) -> list[float]:
     return [tangent.gain(float(one)) for one in won]
 
 
-def columns_of(one: Placed) -> int:
-    """Return how many columns an effect has: one per number, or one for what it does without any."""
-    return max(len(one.numbers), 1)
+def most_promising(
+    tangent: Tangent, candidates: Sequence[Placed], price: Callable[[Placed], float], kind: Callable[[Placed], object]
+) -> list[Placed]:
+    """Return the few candidates of each kind that are likely to win most beyond their price."""
+    gains = glanced(tangent, candidates)
+    ranked = sorted(zip(gains, candidates, strict=True), key=lambda pair: price(pair[1]) - pair[0])
+    kept: dict[object, list[Placed]] = {}
+    for _, one in ranked:
+        kept.setdefault(kind(one), []).append(one)
+    return [one for few in kept.values() for one in few[:PROMISING]]
+
+
+def crowding(tangent: Tangent, placed: Placed, candidates: Sequence[Placed]) -> float:
+    """Return how many times as many nats as noise lets them those beside a candidate win, at least 1."""
+    others = placed.beside(candidates)
+    if len(others) < rules.FEW_AROUND:
+        return 1.0
+    usual = float(np.median(glanced(tangent.without(placed), others)))
+    # The quantile of a chance that the median of so many reaches in noise.
+    half = (len(others) + 1) / 2
+    chance = float(betaincinv(half, half, rules.CROWDED))
+    return max(1.0, usual / float(gammaincinv(len(placed.strength) / 2, chance)))
 
 
 class _Pull:

@@ -13,12 +13,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import betaincinv, gammaincinv
 
-from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted, by_pieces, gain, normal, scaled_inverse, whitened
-from latticebench.diagnosis.glance import columns_of, glanced
 from latticebench.diagnosis.horizon import fields
 from latticebench.diagnosis.model import Assembled, Model, read_term
 from latticebench.diagnosis.propagation import propagate
@@ -32,8 +29,6 @@ if TYPE_CHECKING:
 
 # Numbers that are worked on at a time.
 CHUNK = 2_000_000
-# Candidates of a kind whose score is computed in full.
-LIKELIEST = 12
 # Directions that the model can do already, as a share of what a candidate does.
 OLD = 1e-4
 
@@ -189,29 +184,11 @@ class Tangent:
         other.left, other.basis, other.taken = left, basis, taken
         return other
 
-    def likeliest(
-        self, candidates: Sequence[Placed], price: Callable[[Placed], float], kind: Callable[[Placed], object]
-    ) -> list[Placed]:
-        """Return the few candidates of each kind that are likely to win most beyond their price."""
-        gains = glanced(self, candidates)
-        ranked = sorted(zip(gains, candidates, strict=True), key=lambda pair: price(pair[1]) - pair[0])
-        kept: dict[object, list[Placed]] = {}
-        for _, one in ranked:
-            kept.setdefault(kind(one), []).append(one)
-        return [one for few in kept.values() for one in few[:LIKELIEST]]
-
-    def crowding(self, placed: Placed, candidates: Sequence[Placed]) -> float:
-        """Return how many times as many nats as noise lets them those beside a candidate win, at least 1."""
-        others = placed.beside(candidates)
-        if len(others) < rules.FEW_AROUND:
-            return 1.0
+    def without(self, placed: Placed) -> Tangent:
+        """Return the tangent of what is left when an effect has done all that it can do."""
         # A line has wings.
         basis = _orthonormal(np.concatenate([self.free, self._responses([placed]).columns], axis=1))
-        usual = float(np.median(glanced(self._other(self.left - basis @ (basis.T @ self.left), basis), others)))
-        # The quantile of a chance that the median of so many reaches in noise.
-        half = (len(others) + 1) / 2
-        chance = float(betaincinv(half, half, rules.CROWDED))
-        return max(1.0, usual / float(gammaincinv(len(placed.strength) / 2, chance)))
+        return self._other(self.left - basis @ (basis.T @ self.left), basis)
 
     def start(
         self, placed: Placed, dropped: Sequence[int] = ()
@@ -409,6 +386,11 @@ class Tangent:
             wide = replace(base, least_reach=(left, right))
             self.evaluators[number, reach] = wide.evaluator(along.t, along.states, self._input(number), along.driven)
         return self.evaluators[number, reach]
+
+
+def columns_of(one: Placed) -> int:
+    """Return how many columns an effect has: one per number, or one for what it does without any."""
+    return max(len(one.numbers), 1)
 
 
 def _orthonormal(columns: Float[ndarray, "readings numbers"]) -> Float[ndarray, "readings held"]:

@@ -17,6 +17,7 @@ from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.border import MOST
 from latticebench.diagnosis.fitting import Fitted
+from latticebench.diagnosis.glance import crowding, most_promising
 from latticebench.diagnosis.horizon import Layout, unread
 from latticebench.diagnosis.inputs import interpolations, likeliest
 from latticebench.diagnosis.mirrored import images, mirrored
@@ -442,7 +443,7 @@ class Search:
         if timed:
             past = past_of(self.problem, fitted.layout, fitted.model, fitted.followed.nodes)
             courses = [one.with_past(past) for one in self.open if one.timed]
-            absent += tangent.likeliest(courses, self.problem.price_of, lambda one: one.effect.name)
+            absent += most_promising(tangent, courses, self.problem.price_of, lambda one: one.effect.name)
         best: dict[tuple[object, ...], tuple[float, Scored]] = {}
         tried: dict[str, Tried] = {}
         for one in tangent.scored(absent):
@@ -451,7 +452,7 @@ class Search:
             if name not in tried or one.gain - price > tried[name].gain - tried[name].price:
                 tried[name] = Tried(name, one.gain, price)
             if one.placed.frequency is not None and one.gain > price:
-                price *= max(1.0, tangent.crowding(one.placed, self.open) / fitted.dispersion)
+                price *= max(1.0, crowding(tangent, one.placed, self.open) / fitted.dispersion)
             key = one.placed.place
             least = max(price, own.price_of(one.placed) * fitted.dispersion / rules.UNDERSTATED)
             if one.freedom and one.gain > least and (key not in best or one.gain - price > best[key][0]):

@@ -11,6 +11,7 @@ import numpy as np
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
+from latticebench.diagnosis.glance import crowding
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.score import Tangent
@@ -105,12 +106,12 @@ def same(one: Fitted, other: Fitted) -> bool:
 
 
 @functools.lru_cache(maxsize=64)
-def crowding(problem: Problem, fitted: Fitted) -> tuple[float, ...]:
+def crowdings(problem: Problem, fitted: Fitted) -> tuple[float, ...]:
     """Return for each effect how many times as many nats as noise lets them others beside it still win."""
     if not any(one.timed for one in fitted.model.effects):
         return (1.0,) * len(fitted.model.effects)
     tangent = Tangent(fitted)
-    return tuple(tangent.crowding(one, problem.candidates) for one in fitted.model.effects)
+    return tuple(crowding(tangent, one, problem.candidates) for one in fitted.model.effects)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +141,7 @@ class Worth:
     def price(self, fitted: Fitted) -> float:
         """Return the price of a model: of its effects and of the noise's parameters."""
         noise = fitted.noise.parameters / 2 * np.log(max(fitted.layout.readings(), 2))
-        effects = zip(fitted.model.effects, crowding(self.problem, fitted), strict=True)
+        effects = zip(fitted.model.effects, crowdings(self.problem, fitted), strict=True)
         misfit = 1.0 if self.best is None else self.best.dispersion
         prices = sum(self.price_of(one) * max(1.0, many / misfit) for one, many in effects)
         return prices + float(noise) + repelling(self.problem, fitted.model)

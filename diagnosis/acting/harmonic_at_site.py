@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from latticebench.diagnosis.acting.harmonic import Harmonic
-from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Placed, Scene, Summand, times
+from latticebench.diagnosis.acting.placed import AtOneSite, Placed, Scene
 from latticebench.systems.effects import Effect
 
 
@@ -21,12 +21,3 @@ class HarmonicAtSite(AtOneSite, Harmonic, acts="harmonic at one site"):
         for site in scene.chain.moving if texts and scene.chain.sites > 1 else ():
             for omega in scene.frequencies:
                 yield cls(effect=effect, texts=texts, omega=float(omega), strength=(0.0,) * (2 * len(texts)), here=site)
-
-    def summands(self, chain: Chain) -> list[Summand]:  # noqa: ARG002
-        """Return nothing: it is no term of every site."""
-        return []
-
-    def sentences(self, chain: Chain) -> list[str]:
-        """Return what drives the site."""
-        sum_ = " + ".join(times(value, text) for text, value in zip(self.labels(chain), self.strength, strict=True))
-        return [f"site {self.here + 1} alone has {sum_} besides"]

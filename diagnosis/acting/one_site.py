@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Force, Placed, Scene, times
+from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Force, Placed, Scene
 from latticebench.systems.effects import Effect
 
 
@@ -34,8 +34,3 @@ class OneSite(AtOneSite, acts="one site"):
         """Return the terms, with a weight of 1 at the site."""
         pairs = zip(self.texts, self.strength, strict=True)
         return [Force(text, value, {k: 1.0}, self.share(chain)) for k, (text, value) in enumerate(pairs)]
-
-    def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
-        """Return what the site has."""
-        sum_ = " + ".join(times(value, text) for text, value in zip(self.texts, self.strength, strict=True))
-        return [f"site {self.here + 1} alone has {sum_} besides"]

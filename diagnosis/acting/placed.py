@@ -345,6 +345,15 @@ class AtOneSite(Placed):
         """Return 1 at the site, 0 elsewhere."""
         return np.asarray(np.eye(chain.sites)[self.here])
 
+    def summands(self, chain: Chain) -> list[Summand]:  # noqa: ARG002
+        """Return nothing: it is no term of every site."""
+        return []
+
+    def sentences(self, chain: Chain) -> list[str]:
+        """Return what the site has."""
+        sum_ = " + ".join(times(value, text) for text, value in zip(self.labels(chain), self.strength, strict=True))
+        return [f"site {self.here + 1} alone has {sum_} besides"]
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OfSensors(Placed):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Placed, Scene, Summand, times
+from latticebench.diagnosis.acting.placed import AtOneSite, Placed, Scene
 from latticebench.diagnosis.acting.pulse import Pulse, bells
 from latticebench.systems.effects import Effect
 
@@ -21,12 +21,3 @@ class PulseAtSite(AtOneSite, Pulse, acts="pulse at one site"):
         for site in scene.chain.moving if texts and scene.chain.sites > 1 else ():
             for at, width in bells(scene):
                 yield cls(effect=effect, texts=texts, at=at, width=width, strength=(0.0,) * len(texts), here=site)
-
-    def summands(self, chain: Chain) -> list[Summand]:  # noqa: ARG002
-        """Return nothing: it is no term of every site."""
-        return []
-
-    def sentences(self, chain: Chain) -> list[str]:
-        """Return what pushes the site."""
-        sum_ = " + ".join(times(value, text) for text, value in zip(self.labels(chain), self.strength, strict=True))
-        return [f"site {self.here + 1} alone has {sum_} besides"]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
+from latticebench.diagnosis.glance import most_promising
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.search import Search
@@ -71,7 +72,7 @@ class Unnamed:
         likely: dict[int, Placed] = {}
         for tangent in tangents:
             for family in self.many:
-                likely |= {id(one): one for one in tangent.likeliest(family, lambda _: 0.0, lambda _: 0)}
+                likely |= {id(one): one for one in most_promising(tangent, family, lambda _: 0.0, lambda _: 0)}
         for batch in tangents[0].batches([*self.few, *likely.values()]):
             for number, tangent in enumerate(tangents):
                 for before, one in zip(batch, tangent.scored_at_once(batch), strict=True):

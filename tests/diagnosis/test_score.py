@@ -7,12 +7,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.diagnosis.fitting import fit
-from latticebench.diagnosis.glance import _duals, _Pull
+from latticebench.diagnosis.glance import PROMISING, _duals, _Pull, most_promising
 from latticebench.diagnosis.horizon import Layout, follow
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
 from latticebench.diagnosis.problem import Problem
-from latticebench.diagnosis.score import LIKELIEST, Tangent
+from latticebench.diagnosis.score import Tangent
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -74,8 +74,8 @@ def test_a_candidate_wins_in_a_fit_about_what_its_score_says(problem, plain):
 def test_the_likeliest_of_many_are_those_of_the_highest_score(problem, plain):
     tangent = Tangent(plain)
     drives = [one for one in problem.candidates if one.effect.name == "drive"]
-    kept = tangent.likeliest(drives, lambda _: 0.0, lambda one: one.effect.name)
-    assert len(kept) == LIKELIEST < len(drives)
+    kept = most_promising(tangent, drives, lambda _: 0.0, lambda one: one.effect.name)
+    assert len(kept) == PROMISING < len(drives)
     best = max(tangent.scored(drives), key=lambda one: one.gain)
     assert best.placed.frequency in {one.frequency for one in kept}
 
