@@ -131,11 +131,21 @@ def test_an_effect_that_is_there_is_not_doubted(name, force):
 
 @pytest.mark.parametrize(
     ("name", "force"),
-    [("local-damping", lambda t, u, v: -0.05 * np.eye(len(u))[1] * v),
-     ("local-drive", lambda t, u, v: 0.05 * np.cos(2.6 * t) * np.eye(len(u))[1]),
-     ("local-kick", lambda t, u, v: 0.3 * np.exp(-((t - 12) ** 2) / 2) * np.eye(len(u))[1]),
-     ("bond-defect", lambda t, u, v: 0.05 * np.array([0.0, u[2] - u[1], u[1] - u[2], 0.0]))],
-)  # fmt: skip
+    [
+        ("local-drive", lambda t, u, v: 0.05 * np.cos(2.6 * t) * np.eye(len(u))[1]),
+        pytest.param("local-damping", lambda t, u, v: -0.05 * np.eye(len(u))[1] * v, marks=pytest.mark.slow),
+        pytest.param(
+            "local-kick",
+            lambda t, u, v: 0.3 * np.exp(-((t - 12) ** 2) / 2) * np.eye(len(u))[1],
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "bond-defect",
+            lambda t, u, v: 0.05 * np.array([0.0, u[2] - u[1], u[1] - u[2], 0.0]),
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
 def test_what_acts_at_one_site_or_bond_is_named_where_it_is(name, force):
     found = diagnose(PLAIN, 2, [chain(force)], CATALOGUE)
     assert [(one.name, one.site) for one in found.findings] == [(name, 1)]
