@@ -152,12 +152,15 @@ def _bond(problem: Problem, here: int) -> tuple[Force, Force]:
 
 
 def swinging(problem: Problem) -> Iterator[Pushed]:
-    """Yield what swings at one frequency: waves along the chain, terms at all sites."""
+    """Yield what swings at one frequency: forces at single sites, waves along the chain, terms at all sites."""
     chain, scene = problem.chain, problem.scene
     stride = len(scene.frequencies) // MOST_FREQUENCIES + 1
+    sites = np.eye(chain.sites)
     texts = [text for text in _base(problem) if text not in ("1", "u[n]")]
     for omega in scene.frequencies[::stride]:
         waves = [Wave("cos", float(omega)), Wave("sin", float(omega))]
+        for here in chain.moving if chain.sites > 1 else ():
+            yield _pushed(chain, "a force of its own course in time", ["1"], [sites[here]], waves, here)
         for number in range(1, chain.sites // 2 + 1):
             angle = 2 * np.pi * number / chain.sites
             shapes = [function(angle * np.arange(chain.sites)) for function in (np.cos, np.sin)]
