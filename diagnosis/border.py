@@ -223,15 +223,19 @@ class _Read:
         basis, _, width = _basis(self.t, self.times, intervals, degree)
         design = _design(basis, self.t)
         left = free = count = 0.0
-        for value, seen in zip(self.value.T, self.seen.T, strict=True):
+        masks, which = np.unique(self.seen, axis=1, return_inverse=True)
+        for k, seen in enumerate(masks.T):
+            if not np.any(seen):
+                continue
+            value = self.value[:, which == k]
             whiten = self._innovations(seen)
-            target = (whiten @ value)[:, None]
-            size = max(float(np.std(value[seen])), 1e-12) if np.any(seen) else 1.0
-            own = (whiten @ design).tocsr()
+            target, own = whiten @ value, (whiten @ design).tocsr()
             rest = target - own @ _least_squares(own, seen[:, None].astype(float), target)
+            size = np.maximum(np.std(value[seen], axis=0), 1e-12)
             left += float(np.sum((rest[seen] / size) ** 2))
-            free += min(float(len(self.t) * width), float(np.sum(seen)))
-            count += float(np.sum(seen))
+            read, columns = float(np.sum(seen)), value.shape[1]
+            free += columns * min(float(len(self.t) * width), read)
+            count += columns * read
         return left, free, count
 
     def _innovations(self, seen: Bool[ndarray, " rows"]) -> csr_array:
@@ -245,10 +249,9 @@ class _Read:
 
 def _design(basis: BSplines, t: Float[ndarray, "pieces m"]) -> csr_array:
     """Return the values of all pieces' B-splines at their rows, as a matrix (rows, splines)."""
-    begin, value, _ = basis.basis(t.ravel())
-    columns = begin[:, None] + np.arange(basis.degree + 1)
-    rows = np.broadcast_to(np.arange(t.size)[:, None], columns.shape)
-    return csr_array((value.ravel(), (rows.ravel(), columns.ravel())), shape=(t.size, basis.count))
+    from scipy.interpolate import BSpline
+
+    return csr_array(BSpline.design_matrix(t.ravel(), basis.knots, basis.degree, extrapolate=True))
 
 
 def _least_squares(design: csr_array, weight: ndarray, target: Float[ndarray, "rows columns"]) -> ndarray:

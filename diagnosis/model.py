@@ -65,7 +65,7 @@ class Model:
     @property
     def blocks(self) -> list[slice]:
         """The numbers of each effect."""
-        ends = np.cumsum([len(self.coefficients), *(len(one.numbers) for one in self.effects)])
+        ends = np.cumsum([len(self.coefficients), *(one.count for one in self.effects)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
     @property

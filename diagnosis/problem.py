@@ -271,7 +271,7 @@ class Problem:
 
     def price_of(self, placed: Placed) -> float:
         """Return the price of an effect in its place."""
-        return self.price(placed.effect.name, len(placed.numbers))
+        return self.price(placed.effect.name, placed.count)
 
 
 @functools.lru_cache(maxsize=4096)

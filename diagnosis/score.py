@@ -205,7 +205,7 @@ class Tangent:
             block, gone = model.blocks[number], model.effects[number].strength
             kept[block] = False
             change[block.start : block.start + len(gone)] = -np.array(gone)
-        own = np.concatenate([placed.strength, np.zeros(len(placed.shape))]) if len(placed.numbers) else np.ones(1)
+        own = np.concatenate([placed.strength, np.zeros(len(placed.shape))]) if placed.count else np.ones(1)
         pushed = [column @ own for column in by_pieces(layout, self._whitened([placed]))]
         target = self.left - self.free @ change - self._moving_on([one[..., None] for one in pushed])[:, 0]
         others = self.free[:, kept]
@@ -268,7 +268,7 @@ class Tangent:
             begin = block.stop
             part = seen.columns[:, block] / unit[block]
             curved = part.T @ part - shared[:, block].T @ shared[:, block]
-            if not len(one.numbers):
+            if not one.count:
                 numbers, freedom = unit[block], 1
                 won = float((2 * slopes[block] * numbers - np.diag(curved) * numbers**2)[0])
             else:
@@ -390,7 +390,7 @@ class Tangent:
 
 def columns_of(one: Placed) -> int:
     """Return how many columns an effect has: one per number, or one for what it does without any."""
-    return max(len(one.numbers), 1)
+    return max(one.count, 1)
 
 
 def _orthonormal(columns: Float[ndarray, "readings numbers"]) -> Float[ndarray, "readings held"]:

@@ -364,7 +364,7 @@ class Search:
 
     def _rather(self, one: Scored, placed: Placed) -> bool:
         """Return whether a candidate is to be tried in the place of an effect."""
-        if len(one.placed.numbers) < len(placed.numbers):
+        if one.placed.count < placed.count:
             return True
         return one.gain + self.problem.price_of(placed) > 1 + self.problem.price_of(one.placed)
 

@@ -211,6 +211,11 @@ class Placed(ABC):
         """All numbers that a fit changes."""
         return np.array([*self.strength, *(getattr(self, name) for name in self.shape)], dtype=float)
 
+    @property
+    def count(self) -> int:
+        """How many numbers a fit changes."""
+        return len(self.strength) + len(self.shape)
+
     def moved(self, numbers: Sequence[float] | Float[ndarray, " numbers"]) -> Self:
         """Return the same effect with other numbers."""
         count = len(self.strength)

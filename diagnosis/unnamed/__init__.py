@@ -128,7 +128,7 @@ class _Instead:
         effects = [fitted.model.effects[k] for k in numbers]
         named = sum(search.worth.price_of(effect) for effect in effects)
         # A name is no disadvantage.
-        alike = one.freedom >= sum(len(effect.numbers) for effect in effects)
+        alike = one.freedom >= sum(effect.count for effect in effects)
         saved = named - (max(price, named) if alike else price)
         return cls(numbers, one.placed, (taken - one.won) / 2 / fitted.dispersion - saved, saved)
 

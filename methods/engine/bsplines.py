@@ -10,6 +10,7 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy import ndarray
+    from scipy.interpolate import BSpline
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +65,15 @@ class BSplines:
             slope[:, j + 1] += share
         return span - degree, value, slope
 
-    def design(self, t: Float[ndarray, " time"], derivative: int) -> Float[ndarray, "time splines"]:
-        """Return the values of all B-splines, or of their derivatives, as a matrix."""
+    def curve(self, coefficients: Float[ndarray, "splines *each"]) -> BSpline:
+        """Return the curve of given coefficients: a function of times and of the derivative's order."""
         from scipy.interpolate import BSpline
 
-        return np.asarray(BSpline(self.knots, np.eye(self.count), self.degree)(t, derivative))
+        return BSpline.construct_fast(self.knots, coefficients, self.degree)
+
+    def design(self, t: Float[ndarray, " time"], derivative: int) -> Float[ndarray, "time splines"]:
+        """Return the values of all B-splines, or of their derivatives, as a matrix."""
+        return np.asarray(self.curve(np.eye(self.count))(t, derivative))
 
 
 def through(

@@ -114,9 +114,8 @@ class Stretches:
         """
         if self.drive is None or splines is None:
             return None
-        first, *curves = self.drive.basis(t)
-        local = splines[first[:, None] + np.arange(self.drive.degree + 1)]
-        return np.stack([np.einsum("bl,blps->bps", curve, local) for curve in curves[: self.dynamics.order]], axis=1)
+        curve = self.drive.curve(splines)
+        return np.stack([curve(t, derivative) for derivative in range(self.dynamics.order)], axis=1)
 
     def run(
         self,
