@@ -58,6 +58,11 @@ class Offset(OfSensors, acts="offset"):
         return Misreading(np.tensordot(self.strength, by, 1), np.zeros_like(field), by)
 
     def sentences(self, chain: Chain) -> list[str]:
-        """Return how far each sensor is off."""
+        """Return how far each sensor is off, and from what that is counted."""
         pairs = zip(self.labels(chain), self.strength, strict=True)
-        return [f"{label}: {value:.{DIGITS}g}" for label, value in pairs]
+        lines = [f"{label}: {value:.{DIGITS}g}" for label, value in pairs]
+        outer = sorted({*range(chain.sites)} - {*chain.moving} - {*self.sites})
+        if self.every and outer:
+            names = " and ".join(f"u{site + 1}" for site in outer)
+            lines.append(f"these offsets are relative to the zeros of {names}, which are taken as right")
+        return lines

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from latticebench.diagnosis.acting import WAYS, Force, Placed
+from latticebench.diagnosis.acting import WAYS, Chain, Force, Placed
 from latticebench.diagnosis.fitting import fit
 from latticebench.diagnosis.horizon import Layout, follow, linearised
 from latticebench.diagnosis.model import Model
@@ -213,6 +213,15 @@ def test_every_way_of_acting_is_said_in_words_and_in_mathematics(way, is_complex
     assert one.site is None or one.settings()["site"] == one.site + 1
     assert HOW[way]
     assert hash(one.place) == hash(one.moved(one.numbers).place)
+
+
+@pytest.mark.parametrize(("ends", "moving"), [("free", (0, 1, 2, 3)), ("unknown", (1, 2))])
+def test_offsets_beside_unknown_ends_name_the_sensors_that_are_taken_as_right(ends, moving):
+    chain = Chain(sites=4, order=2, is_complex=False, levels=1, ends=ends, moving=moving, reach=1)
+    one = WAYS["offset"](effect=find("sensor-offset"), sites=moving, parts=1, every=True, strength=(0.1,) * len(moving))
+    assert [line for line in one.sentences(chain) if "u1 and u4" in line] == [
+        "these offsets are relative to the zeros of u1 and u4, which are taken as right"
+    ] * (ends == "unknown")
 
 
 def test_any_two_ways_of_acting_are_told_apart_by_the_same_measurement_in_either_order():
