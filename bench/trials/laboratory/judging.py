@@ -5,9 +5,7 @@ its own; what is found beyond that is invented. Several offsets, or gains, of di
 
 Intervals are those of the model that is named. Gains are relative: where another sensor gives the unit of u than in the
 truth, true values are said in that unit. Where a force is named that does the same as the true one, or is at another
-site, the numbers of all forces are those beside that one, and none is compared; likewise of sensors. Where the ends are
-unknown, zeros are those of the outer sensors, which are taken as right: what is static in the motion beside them cannot
-be told from offsets. Unless these sensors are right, no offset is compared.
+site, the numbers of all forces are those beside that one, and none is compared; likewise of sensors.
 """
 
 from __future__ import annotations
@@ -20,8 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from latticebench.bench.trials.laboratory.effects import GAIN, OFFSET
-
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
@@ -31,7 +27,7 @@ if TYPE_CHECKING:
     from latticebench.diagnosis.repair import Diagnosis
 
 # Effects of which one may be found at several sensors.
-ONE_FOR_ALL = (OFFSET, GAIN)
+ONE_FOR_ALL = ("sensor-offset", "sensor-gain")
 # What an instrument of a kind does by itself: a finding says so, or the noise model holds it.
 OF_INSTRUMENT = {"drifting-zero": "sensor-drift"}
 # The power of the unit of u by which the parameters of effects grow, where it is not 0.
@@ -156,16 +152,13 @@ class Judgement:
     covered: tuple[int, int]
 
 
-def judge(
-    truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], instrument: str = "", ends: str = ""
-) -> Judgement:
+def judge(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], instrument: str = "") -> Judgement:
     """Return how well findings agree with what is in a recording.
 
     Args:
         truth: effects, as `written` gives them.
         found: by the diagnosis.
         instrument: its kind; what that does by itself is not invented, and need not be found.
-        ends: of the chain.
     """
     found = [one for one in found if one.name != OF_INSTRUMENT.get(instrument)]
     pairs = matched(truth, found)
@@ -182,8 +175,6 @@ def judge(
             placed.append(found[j].site in one["sites"])
         if _of_sensors(one["name"]) not in others:
             values = _together(found, j)
-            if ends == "unknown" and one["name"] == OFFSET and not set(one["parameters"]) <= set(values):
-                continue
             covered += list(_intervals(_said_in(unit, one, values), values))
     return Judgement(
         named, missed, invented, not missed and not invented, right_alike, (sum(placed), len(placed)),
@@ -214,7 +205,7 @@ def _unit(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], pairs: S
     It is 1 unless one gain of the truth is not found, and those of all other sensors are, or one that does the same.
     """
     for one, j in zip(truth, pairs, strict=True):
-        if j is None or not one["name"] == found[j].name == GAIN:
+        if j is None or not one["name"] == found[j].name == "sensor-gain":
             continue
         missing = [value for name, value in one["parameters"].items() if name not in _together(found, j)]
         if len(missing) == 1 and (len(found[j].values) > 1 or found[j].site in one["sites"]):
@@ -225,7 +216,7 @@ def _unit(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], pairs: S
 def _said_in(unit: float, one: Mapping[str, Any], values: Mapping[str, tuple[float, float]]) -> dict[str, float]:
     """Return the true parameters of an effect in the unit of u of the values that are found."""
     true = dict(one["parameters"])
-    if unit != 1 and one["name"] == GAIN:
+    if unit != 1 and one["name"] == "sensor-gain":
         true = {name: true.get(name, 1.0) for name in values}
     factor = unit ** POWERS.get(one["name"], 0)
     return {name: value if name == "omega" else value * factor for name, value in true.items()}

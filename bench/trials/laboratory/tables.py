@@ -61,7 +61,7 @@ def _row(incomplete: Mapping[str, Any]) -> dict[str, Any]:
     row["truth"] = " + ".join(f"{one['name']} z={one['z']:.3g}" for one in truth)
     if result["status"] != "ok":
         return {**row, "right": False, "right_alike": False} if result["status"] in LOST else row
-    found = judge(truth, found_in(result), made["instrument"], made["ends"])
+    found = judge(truth, found_in(result), made["instrument"])
     row["named"] = " + ".join(" or ".join([one["name"], *one["alternatives"]]) for one in result["findings"])
     row.update(
         right=found.right, right_alike=found.right_alike, missed=" + ".join(found.missed),
@@ -154,7 +154,7 @@ def counts(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
         if result["status"] != "ok":
             continue
         found, truth = found_in(result), result["truth"]
-        judged = judge(truth, found, result["recording"]["instrument"], result["recording"]["ends"])
+        judged = judge(truth, found, result["recording"]["instrument"])
         places = matched(truth, found)
         pairs += [(one["name"], "missed" if j is None else found[j].name) for one, j in zip(truth, places, strict=True)]
         pairs += [("not there", name) for name in judged.invented]

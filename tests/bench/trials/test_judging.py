@@ -73,16 +73,6 @@ def test_offsets_of_several_sensors_are_one_effect_with_all_their_sizes() -> Non
     assert judged.covered == (1, 2)
 
 
-def test_beside_unknown_ends_offsets_are_compared_only_where_the_outer_sensors_are_right() -> None:
-    found = [said("sensor-offset", None, offset_2=(2.0, 0.1), offset_3=(3.0, 0.1))]
-    inner = {"offset_2": 2.0, "offset_3": 1.0}
-    assert judge([there("sensor-offset", None, **inner)], found, ends="unknown").covered == (1, 2)
-    outer = there("sensor-offset", None, offset_1=1.0, offset_4=1.0, **inner)
-    assert judge([outer], found, ends="unknown").covered == (0, 0)
-    assert judge([outer], found, ends="unknown").right
-    assert judge([outer], found, ends="fixed").covered == (1, 2)
-
-
 def test_an_effect_that_does_the_same_counts_where_alike_is_counted() -> None:
     judged = judge([there("defect", 1, ("unequal-masses",))], [said("unequal-masses", 1)])
     assert not judged.right
