@@ -176,6 +176,23 @@ class Chain:
             total[:, site] *= 1 + value[:, 0]
         return total
 
+    def displaced(self, outer: Mapping[int, float], of: Parameters) -> Float[ndarray, " sites"] | None:
+        """Return by how much all sites stand elsewhere when outer ones do; None where forces are not linear in u.
+
+        Args:
+            outer: the displacement of each outer site; the equations of all others are kept.
+            of: parameters, as `rate` takes them, each of one copy.
+        """
+        still = np.zeros((self.sites, self.sites))
+        rest, one, two = (self.rate(0.0, k * self.size * np.eye(self.sites) + still, still, of) for k in (0, 1, 2))
+        force = (one - rest).T / self.size
+        if not np.allclose(two - rest, 2 * (one - rest), rtol=1e-9, atol=1e-12 * np.max(np.abs(force)) * self.size):
+            return None
+        found = np.array([outer.get(k, 0.0) for k in range(self.sites)])
+        inner = [k for k in range(self.sites) if k not in outer]
+        found[inner] = np.linalg.solve(force[np.ix_(inner, inner)], -force[inner] @ found)
+        return found
+
 
 LINEAR = ("u[n]", "sin(u[n])")
 

@@ -5,7 +5,8 @@ its own; what is found beyond that is invented. Several offsets, or gains, of di
 
 Intervals are those of the model that is named. Gains are relative: where another sensor gives the unit of u than in the
 truth, true values are said in that unit. Where a force is named that does the same as the true one, or is at another
-site, the numbers of all forces are those beside that one, and none is compared; likewise of sensors.
+site, the numbers of all forces are those beside that one, and none is compared; likewise of sensors. Offsets count from
+the zeros of the outer sensors where the ends are unknown and none of these is named, see `making.LabEffect.beside`.
 """
 
 from __future__ import annotations
@@ -100,7 +101,7 @@ def written(recording: LabRecording) -> list[dict[str, Any]]:
     return [
         {
             "name": one.name, "site": one.site, "parameters": dict(one.parameters), "z": one.z, "apart": one.apart,
-            "alike": list(one.alike), "sites": list(one.sites),
+            "alike": list(one.alike), "sites": list(one.sites), "beside": dict(one.beside),
         }
         for one in recording.effects
     ]  # fmt: skip
@@ -214,8 +215,11 @@ def _unit(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], pairs: S
 
 
 def _said_in(unit: float, one: Mapping[str, Any], values: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Return the true parameters of an effect in the unit of u of the values that are found."""
-    true = dict(one["parameters"])
+    """Return the true parameters of an effect as those that are found count them: from the same zeros, in that unit."""
+    true, beside = dict(one["parameters"]), one.get("beside") or {}
+    # No outer sensor is named: their zeros are taken as right.
+    if beside and not any(name in values for name in true if name not in beside):
+        true = dict(beside)
     if unit != 1 and one["name"] == "sensor-gain":
         true = {name: true.get(name, 1.0) for name in values}
     factor = unit ** POWERS.get(one["name"], 0)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +24,7 @@ from latticebench.bench.trials.laboratory.effects import (
     LOCAL,
     MOST_EFFECTS,
     NAMES,
+    OFFSET,
     OFTEN,
     Ingredient,
     candidates,
@@ -66,6 +67,9 @@ class LabEffect:
         apart: the share of what it does that nothing else in the recording can do.
         alike: effects each of which would do the same in its place, as far as these readings tell.
         sites: where it would do the same if it acts at one site; its own among them.
+        beside: offsets that a diagnosis should find if it takes the zeros of outer sites without an equation as right:
+            those of the inner sensors less the displacement at rest that those of the outer ones look like. Empty where
+            there are none such, or forces or sensors are not linear.
     """
 
     name: str
@@ -75,6 +79,7 @@ class LabEffect:
     apart: float
     alike: tuple[str, ...] = ()
     sites: tuple[int, ...] = ()
+    beside: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,5 +283,26 @@ def _effects(
         sites = {other.site for other in [one, *same] if other.name == one.name and other.site is not None}
         parameters = one.truth(float(amounts[k]))
         z, apart = float(sight.size(k, every)), float(sight.apart(k, every))
-        found.append(LabEffect(one.name, one.site, parameters, z, apart, tuple(sorted(alike)), tuple(sorted(sites))))
+        beside = _beside(experiment, chosen, amounts) if one.name == OFFSET else {}
+        alike_, sites_ = tuple(sorted(alike)), tuple(sorted(sites))
+        found.append(LabEffect(one.name, one.site, parameters, z, apart, alike_, sites_, beside))
     return tuple(found)
+
+
+def _beside(experiment: Experiment, chosen: Sequence[Ingredient], amounts: ndarray) -> dict[str, float]:
+    """Return the offsets of inner sensors beside outer ones that are taken as right, see `LabEffect.beside`."""
+    chain, reach = experiment.chain, experiment.reach
+    of = dict(zip(chain.declared, chain.coefficients, strict=True))
+    for one, amount in zip(chosen, amounts, strict=True):
+        of.update({one.key(name): value for name, value in one.values(float(amount)).items()})
+    offsets, gains = ([of.get(f"{name}_{k + 1}", 0.0) for k in range(chain.sites)] for name in ("offset", "gain"))
+    outer = [k for k in range(chain.sites) if not reach <= k < chain.sites - reach]
+    if "curve" in of or not any(offsets[k] for k in outer):
+        return {}
+    moved = chain.displaced(
+        {k: offsets[k] / (1 + gains[k]) for k in outer}, {name: np.array([[value]]) for name, value in of.items()}
+    )
+    if moved is None:
+        return {}
+    inner = range(reach, chain.sites - reach)
+    return {f"offset_{k + 1}": float(offsets[k] - (1 + gains[k]) * moved[k]) for k in inner}

@@ -73,6 +73,15 @@ def test_offsets_of_several_sensors_are_one_effect_with_all_their_sizes() -> Non
     assert judged.covered == (1, 2)
 
 
+def test_offsets_beside_unknown_ends_count_from_the_zeros_that_are_taken_as_right() -> None:
+    true = there("sensor-offset", None, offset_1=1.0, offset_2=-2.0, offset_3=3.0)
+    inner = [said("sensor-offset", 1, offset_2=(-4.0, 0.1))]
+    assert judge([true], inner).covered == (0, 1)
+    assert judge([{**true, "beside": {"offset_2": -4.0}}], inner).covered == (1, 1)
+    every = [*inner, said("sensor-offset", 0, offset_1=(1.0, 0.1))]
+    assert judge([{**true, "beside": {"offset_2": -4.0}}], every).covered == (1, 2)
+
+
 def test_an_effect_that_does_the_same_counts_where_alike_is_counted() -> None:
     judged = judge([there("defect", 1, ("unequal-masses",))], [said("unequal-masses", 1)])
     assert not judged.right

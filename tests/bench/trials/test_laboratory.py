@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.interpolate
 import scipy.linalg
 import scipy.stats
 
 from latticebench.bench.trials.laboratory import LabRecording, effects, make_recording, making
+from latticebench.bench.trials.laboratory.chains import draw_chain
 from latticebench.bench.trials.laboratory.instruments import DIGITS, HELD_OUT, KINDS, Instrument, Kind, draw_instrument
 from latticebench.systems.effects import find
 from latticebench.systems.errors import InputError
@@ -307,3 +309,33 @@ def test_the_noise_of_a_recording_is_what_was_added() -> None:
     left = one.samples.u - one.clean
     assert np.sqrt(np.mean(left**2)) == pytest.approx(one.noise[0], rel=1e-9)
     assert 0.0015 < one.noise[0] / noise_size(one.clean, 1.0) < 0.06
+
+
+def test_offsets_beside_unknown_ends_are_those_with_which_the_readings_follow_the_inner_equations() -> None:
+    one = make_recording(3, "white", ["sensor-offset"], sites=5)
+    chain, effect = one.chain, one.effects[0]
+    assert (one.samples.ends, one.declared.texts) == ("unknown", LINEAR)
+    curve = scipy.interpolate.make_interp_spline(one.samples.t, one.clean, k=7)
+    near = chain.shifts[1] + chain.shifts[-1] - 2 * np.eye(5)
+    inner = slice(len(one.samples.t) // 10, -len(one.samples.t) // 10)
+
+    def misfit(offsets: dict[str, float]) -> float:
+        """Return the largest acceleration of an inner site that the equation does not give, in units of all."""
+        u = one.clean - np.array([offsets.get(f"offset_{k + 1}", 0.0) for k in range(5)])
+        left = curve(one.samples.t, 2) - one.coefficients[0] * u @ near.T - one.coefficients[1] * u
+        return float(np.max(np.abs(left[inner, 1:-1])) / (chain.fast**2 * chain.size))
+
+    beside, true = dict(effect.beside), dict(effect.parameters)
+    assert set(beside) == {"offset_2", "offset_3", "offset_4"}
+    assert misfit(beside) < 1e-4
+    assert misfit(true) < 1e-4
+    assert misfit({name: true[name] for name in beside}) > 1e-3
+
+
+def test_where_forces_are_not_linear_no_offsets_do_what_those_of_outer_sensors_do() -> None:
+    chain = draw_chain(np.random.default_rng(1), 3)
+    of = {LINEAR[0]: np.array([[2.0]]), "u[n]": np.array([[-1.0]])}
+    found = chain.displaced({0: 1.0, 2: 3.0}, of)
+    assert found is not None
+    np.testing.assert_allclose(found, [1.0, 2 * (1 + 3) / (2 * 2 + 1), 3.0])
+    assert chain.displaced({0: 1.0, 2: 3.0}, {**of, "u[n]**3": np.array([[-1.0]])}) is None
