@@ -159,11 +159,13 @@ class Tangent:
     def batches(self, candidates: Sequence[Placed]) -> Iterator[list[Placed]]:
         """Yield as many candidates as are worked on at a time, those that act on the motion first."""
         batch: list[Placed] = []
+        columns = 0
         for one in sorted(candidates, key=lambda one: one.instrument):
             batch.append(one)
-            if sum(map(columns_of, batch)) * self.error.size > CHUNK:
+            columns += columns_of(one)
+            if columns * self.error.size > CHUNK:
                 yield batch
-                batch = []
+                batch, columns = [], 0
         if batch:
             yield batch
 

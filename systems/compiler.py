@@ -10,7 +10,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from latticebench.systems.parser import MAX_OFFSET, TermError
 from latticebench.systems.terms import Term, site_symbol, symbolic
@@ -24,8 +24,7 @@ Backend = Literal["numpy", "torch"]
 MOST_FACTORS = 7
 
 
-@dataclass(frozen=True, order=True)
-class Slot:
+class Slot(NamedTuple):
     """A real array that a compiled function takes: part of a field at an offset, the time, or the site number.
 
     Attributes:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from latticebench.systems.compiler import Slot, compiled, partials
+from latticebench.systems.compiler import Compiled, Slot, compiled, partials
 from latticebench.systems.errors import InputError
 from latticebench.systems.stencil import Ends, Stencil, numbers
 from latticebench.systems.terms import Term
@@ -141,12 +141,12 @@ class Dynamics:
         Raises:
             InputError: a term uses f[n], and there is no input.
         """
-        windows = self._windows(y, t, f, driven)
+        read = self._read(y, t, f, driven)
         shape = (len(t), self.count)
         values = np.empty((self.parts, len(self.terms), *shape))
-        for bundle, alike in self._values:
-            for part, value in enumerate(bundle.function(*(windows(slot) for slot in bundle.slots))):
-                values[part, alike] = value
+        for function, places, alike in self._values:
+            for part, value in enumerate(function(*[read[of][where] for of, where in places])):
+                values[part, alike if len(alike) > 1 else alike[0]] = value
         if self.weights is not None:
             values *= self.weights[:, None, self.moving]
         factors = self._factors(t)
@@ -161,7 +161,7 @@ class Dynamics:
         summed = np.matmul(coefficients, values.reshape(self.parts, len(self.terms), -1))
         rate[:, -1] = np.moveaxis(summed.reshape(self.parts, *shape), 0, 1)
         if derivatives:
-            self._add_slopes(found, windows, coefficients, factors)
+            self._add_slopes(found, read, coefficients, factors)
         return rate.reshape(y.shape), values, found
 
     def acting(self, coefficients: Float[ndarray, " terms"]) -> tuple[Dynamics, Float[ndarray, " terms"]]:
@@ -189,12 +189,12 @@ class Dynamics:
 
         The terms must not reach farther than the equation. See `linear` for the arguments and what is raised.
         """
-        windows = self._windows(y, t, f, driven)
+        read = self._read(y, t, f, driven)
 
         def value(term: Term) -> ndarray:
             bundle = compiled((term.text,), self.is_complex)
             found = np.empty((len(t), self.parts, self.count))
-            for part, one in enumerate(bundle.function(*(windows(slot) for slot in bundle.slots))):
+            for part, one in enumerate(bundle.function(*[read[of][where] for of, where in self._places(bundle)])):
                 found[:, part] = one
             return found
 
@@ -203,19 +203,20 @@ class Dynamics:
     def _add_slopes(
         self,
         found: dict[tuple[int, Slot], ndarray],
-        windows: Callable[[Slot], Any],
+        read: Sequence[Any],
         coefficients: ndarray,
         factors: dict[int, ndarray],
     ) -> None:
         """Add to `found` the derivatives of all terms by the variables of the stencil, times their coefficients."""
-        for (slopes, places), alike in self._partials:
+        for function, places, variables, alike in self._partials:
             acting = [term for term in alike if coefficients[term] != 0]
-            if not places or not acting:
+            if not acting:
                 continue
-            outputs = slopes.function(*(windows(slot) for slot in slopes.slots))
-            for (_, part, slot), value in zip(places, outputs, strict=True):
-                share = self._strength(acting, coefficients, factors, part) * value
-                found[part, slot] = found[part, slot] + share if (part, slot) in found else share
+            strength = [self._strength(acting, coefficients, factors, part) for part in range(self.parts)]
+            outputs = function(*[read[of][where] for of, where in places])
+            for variable, value in zip(variables, outputs, strict=True):
+                share, other = strength[variable[0]] * value, found.get(variable)
+                found[variable] = share if other is None else other + share
 
     def _strength(
         self, terms: Sequence[int], coefficients: ndarray, factors: dict[int, ndarray], part: int
@@ -271,11 +272,18 @@ class Dynamics:
     @functools.cached_property
     def _values(self) -> Any:
         # Each term is compiled once, whatever the equation that it stands in, and evaluated once for all its weights.
-        return [(compiled((text,), self.is_complex), alike) for text, alike in self._alike.items()]
+        bundles = [(compiled((text,), self.is_complex), alike) for text, alike in self._alike.items()]
+        return [(one.function, self._places(one), alike) for one, alike in bundles]
 
     @functools.cached_property
     def _partials(self) -> Any:
-        return [(partials((text,), self.is_complex), alike) for text, alike in self._alike.items()]
+        found = []
+        for text, alike in self._alike.items():
+            slopes, variables = partials((text,), self.is_complex)
+            if variables:
+                by = [(part, slot) for _, part, slot in variables]
+                found.append((slopes.function, self._places(slopes), by, alike))
+        return found
 
     @functools.cached_property
     def _alike(self) -> dict[str, list[int]]:
@@ -296,23 +304,49 @@ class Dynamics:
             whole[..., self.border] = driven
         return whole
 
-    def _windows(self, y: ndarray, t: ndarray, f: ndarray | None, driven: ndarray | None) -> Callable[[Slot], Any]:
-        stencil = self.stencil
-        fields = stencil.pad(self.whole(y, driven))
-        force = None if f is None else stencil.pad(f)
+    def window(self, slot: Slot) -> tuple[Any, ...]:
+        """Return where a slot of u or v is in padded fields (., order, parts, ...), for all sites with an equation."""
+        if slot not in self._known_windows:
+            self._known_windows[slot] = (slice(None), *slot.place, *self.stencil.window(slot.vector))
+        return self._known_windows[slot]
 
-        def window(slot: Slot) -> Any:
+    @functools.cached_property
+    def _known_windows(self) -> dict[Slot, tuple[Any, ...]]:
+        return {}
+
+    def _places(self, bundle: Compiled) -> list[tuple[int, Any]]:
+        """Return which of the arrays of `_read` a compiled function takes, and which part of each."""
+        found: list[tuple[int, Any]] = []
+        for slot in bundle.slots:
             if slot.name == "t":
-                return t[:, None]
-            if slot.name == "n":
-                return numbers(self.sites)[self.moving]
-            if slot.name == "f":
-                if force is None:
-                    raise InputError("the terms use f[n], but there is no measured input")
-                return force[(slice(None), *stencil.window(slot.vector))]
-            return fields[(slice(None), *slot.place, *stencil.window(slot.vector))]
+                found.append((TIMES, (slice(None), None)))
+            elif slot.name == "n":
+                found.append((NUMBERS, self.moving))
+            elif slot.name == "f":
+                found.append((INPUT, (slice(None), *self.stencil.window(slot.vector))))
+            else:
+                found.append((FIELDS, self.window(slot)))
+        return found
 
-        return window
+    def _read(self, y: ndarray, t: ndarray, f: ndarray | None, driven: ndarray | None) -> tuple[Any, ...]:
+        """Return what terms are functions of: `FIELDS`, `INPUT`, `TIMES` and `NUMBERS`."""
+        pad = self.stencil.pad
+        return pad(self.whole(y, driven)), _NoInput() if f is None else pad(f), t, self._numbers
+
+    @functools.cached_property
+    def _numbers(self) -> ndarray:
+        return numbers(self.sites)
+
+
+# Places of arrays in what `Dynamics._read` returns.
+FIELDS, INPUT, TIMES, NUMBERS = range(4)
+
+
+class _NoInput:
+    """Stands where a measured input would be."""
+
+    def __getitem__(self, _: object) -> ndarray:
+        raise InputError("the terms use f[n], but there is no measured input")
 
 
 def split_parts(field: ndarray, is_complex: bool) -> Float[ndarray, "time parts sites"]:

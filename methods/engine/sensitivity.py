@@ -358,7 +358,7 @@ class Stretches:
         else:
             padded = dynamics.stencil.pad(field, after=1)
             for (part, slot), slope in slopes.items():
-                window = padded[(slice(None), *slot.place, *dynamics.stencil.window(slot.vector))]
+                window = padded[dynamics.window(slot)]
                 target[:, -1, part] += (np.atleast_2d(slope).T if np.ndim(slope) else slope) * window
         if by_terms:
             own = columns - extra - terms
