@@ -19,6 +19,7 @@ from latticebench.diagnosis.propagation import propagate
 from latticebench.diagnosis.score import Tangent, columns_of
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
     from numpy import ndarray
 
 # Candidates of a kind whose score is computed in full.
@@ -29,7 +30,7 @@ DIRECTIONS, ALIKE = 24, 1e-3
 SIGNS = 0
 
 
-def glanced(tangent: Tangent, candidates: Sequence[Placed]) -> list[float]:
+def glanced(tangent: Tangent, candidates: Sequence[Placed]) -> Float[ndarray, " candidates"]:
     """Return about how many nats forces would win, without what each of them would do to the readings."""
     ends = np.cumsum([0, *map(columns_of, candidates)])
     by = np.zeros((ends[-1], 1 + DIRECTIONS))
@@ -47,7 +48,7 @@ def glanced(tangent: Tangent, candidates: Sequence[Placed]) -> list[float]:
         slopes = np.einsum("cnk,cn->ck", u, block[:, :, 0])
         held = values > ALIKE
         won[alike] = DIRECTIONS * np.sum(np.where(held, slopes / np.where(held, values, 1.0), 0.0) ** 2, axis=1)
-    return [tangent.gain(float(one)) for one in won]
+    return tangent.gain(won)
 
 
 def most_promising(

@@ -299,10 +299,10 @@ class Tangent:
             gains += gain(total, after, count, self.fitted.least[number]) if count else 0.0
         return [float(one) for one in gains]
 
-    def gain(self, won: float) -> float:
+    def gain(self, won: Float[ndarray, " candidates"]) -> Float[ndarray, " candidates"]:
         """Return the nats that so much of the sum of squares is worth, the size of the noise being free."""
         total, count = float(np.sum(self.error**2)), float(np.sum(self._read))
-        return float(gain(total, total - won, count, np.min(self.fitted.least)))
+        return gain(total, total - won, count, float(np.min(self.fitted.least)))
 
     def _columns(self, number: int, batch: Sequence[Placed]) -> ndarray:
         """Return what the numbers of effects do to the readings of one recording: (rows, channels, numbers)."""

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 Factor = Callable[["ndarray"], "ndarray"]
 
+# Places of what terms read in `Dynamics._read`.
+FIELDS, INPUT, TIMES, NUMBERS = range(4)
+
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
@@ -336,10 +339,6 @@ class Dynamics:
     @functools.cached_property
     def _numbers(self) -> ndarray:
         return numbers(self.sites)
-
-
-# Places of arrays in what `Dynamics._read` returns.
-FIELDS, INPUT, TIMES, NUMBERS = range(4)
 
 
 class _NoInput:

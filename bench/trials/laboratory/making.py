@@ -279,13 +279,12 @@ def _effects(
     found = []
     for k, one in enumerate(chosen):
         same = [others[j - len(chosen)] for j in beyond if does([k], j, ALIKE)]
-        alike = {other.name for other in same} - {one.name}
+        alike = tuple(sorted({other.name for other in same} - {one.name}))
         sites = {other.site for other in [one, *same] if other.name == one.name and other.site is not None}
         parameters = one.truth(float(amounts[k]))
         z, apart = float(sight.size(k, every)), float(sight.apart(k, every))
         beside = _beside(experiment, chosen, amounts) if one.name == OFFSET else {}
-        alike_, sites_ = tuple(sorted(alike)), tuple(sorted(sites))
-        found.append(LabEffect(one.name, one.site, parameters, z, apart, alike_, sites_, beside))
+        found.append(LabEffect(one.name, one.site, parameters, z, apart, alike, tuple(sorted(sites)), beside))
     return tuple(found)
 
 
