@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -74,6 +75,23 @@ def test_the_page_on_the_limit_says_what_the_table_of_efficiencies_says(script: 
     for part in counts.PARTS:
         for method, group in found[found["part"] == part].groupby("method"):
             assert f"`{method}` {counts.ends(group['efficiency'])}" in text, (part, method)
+
+
+def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings_say() -> None:
+    def share(text: str) -> str:
+        """Return "97.4 (92.6-99.1) of 115" as the page has it."""
+        found = re.fullmatch(r"(\S+) \((\S+)-(\S+)\) of (\d+)", text)
+        assert found, text
+        value, low, high = (float(one) for one in found.groups()[:3])
+        return f"{value:.0f} % ({low:.0f}-{high:.0f}) of {found[4]}"
+
+    summary = pd.read_csv(RESULTS / "loop" / "laboratory" / "summary.csv", comment="#", dtype=str)
+    every = summary[summary["by"] == "all"].iloc[0]
+    for column in ("right", "residual at most 1.3", "intervals that hold", "forecast worse"):
+        assert f"| {share(every[column])} |" in words("diagnosis"), column
+    exact = share(every["right"])
+    short = f"{exact.split(' (')[0]} of {exact.split()[-1]} laboratory recordings"
+    assert short in " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
 
 
 def test_the_page_on_methods_says_what_the_table_of_limits_says(script: Callable[[str], ModuleType]) -> None:
