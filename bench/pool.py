@@ -8,7 +8,7 @@ file of the user's is used for no other code.
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from queue import Empty, SimpleQueue
 from types import TracebackType
@@ -57,9 +57,9 @@ class Pool:
         self.events: Events = SimpleQueue()
         self.folders, self.guardian = Folders(), Guardian()
         self.workers: list[Process | None] = [None] * size
-        # Of the workers that are on a case, the number of its try.
-        self.tries: dict[Process, int] = {}
-        self.later: deque[tuple[float, tuple[Case, int]]] = deque()
+        self.later: deque[tuple[float, Case]] = deque()
+        # How many workers died while they were on a case, by its identity.
+        self.deaths: Counter[str] = Counter()
         self.looked = 0.0
 
     def __enter__(self) -> Pool:
@@ -96,68 +96,80 @@ class Pool:
             pulse: is called about every POLL seconds.
         """
         # A worker is then started anew for each such code once, not at every second case.
-        queue = deque((case, 1) for case in sorted(cases, key=foreign))
+        queue = deque(sorted(cases, key=foreign))
         self.folders = folders
+        ended: list[tuple[Case, dict[str, Any]]] = []
         try:
-            while queue or self.later or self.tries:
-                self._begin(queue, begin)
-                for case, number, result in self._results():
-                    if result["status"] == "died" and number < TRIES:
-                        queue.appendleft((case, number + 1))
-                    else:
-                        keep(case, result)
+            while queue or self.later or self._busy() or ended:
+                try:
+                    self._begin(queue, begin)
+                finally:
+                    # Writing them to the disk takes a while, in which the workers are on their next cases.
+                    while ended:
+                        keep(*ended.pop())
                 pulse()
+                for case, result in self._results():
+                    if result["status"] == "died" and self.deaths[case.identity] < TRIES - 1:
+                        self.deaths[case.identity] += 1
+                        queue.appendleft(case)
+                    else:
+                        ended.append((case, result))
+                for worker in self.workers:
+                    queue.extendleft(worker.lost() if worker is not None else ())
         except BaseException:
             self._close()
             raise
 
-    def _begin(self, queue: deque[tuple[Case, int]], ask: Callable[[Case], Turn]) -> None:
-        """Give each worker that waits a case."""
+    def _busy(self) -> list[Process]:
+        return [worker for worker in self.workers if worker is not None and worker.cases]
+
+    def _begin(self, queue: deque[Case], ask: Callable[[Case], Turn]) -> None:
+        """Give each worker that waits a case, and each on quick cases one beforehand."""
         while self.later and self.later[0][0] <= time.monotonic():
             queue.append(self.later.popleft()[1])
-        for place, worker in enumerate(self.workers):
-            if worker in self.tries:
-                continue
-            while queue:
-                case, number = queue.popleft()
+        busy = self._busy()
+        if not queue and len(busy) < len(self.workers):
+            # What waits behind a case that takes its time is for those that have none.
+            queue.extend(case for worker in busy if (case := worker.give_back()) is not None)
+        for place in range(len(self.workers)):
+            while queue and self._room(place, queue[0]):
+                case = queue.popleft()
                 turn = ask(case)
                 if turn == "later":
-                    self.later.append((time.monotonic() + AGAIN, (case, number)))
+                    self.later.append((time.monotonic() + AGAIN, case))
                 elif turn == "run":
-                    self._start(place, case, number)
-                    break
+                    self._start(place, case)
 
-    def _start(self, place: int, case: Case, number: int) -> None:
+    def _room(self, place: int, case: Case) -> bool:
+        """Return whether the worker of a place can be handed a case now."""
+        worker = self.workers[place]
+        return worker is None or not worker.cases or (worker.takes_another and worker.code == foreign(case))
+
+    def _start(self, place: int, case: Case) -> None:
         code, worker = foreign(case), self.workers[place]
         if worker is not None and (worker.closed or worker.code != code):
             worker.close()
             worker = None
         if worker is None:
             worker = self.workers[place] = Process(code, self.events, self.guardian)
-        worker.start(case, self.folders)
-        self.tries[worker] = number
+        worker.hand(case, self.folders)
 
-    def _results(self) -> list[tuple[Case, int, dict[str, Any]]]:
-        """Wait a moment, and return what has ended: the case, the number of the try, and the result."""
+    def _results(self) -> list[tuple[Case, dict[str, Any]]]:
+        """Wait a moment, and return what has ended: the case, and the result."""
         found = []
         try:
             worker, line = self.events.get(timeout=POLL)
-            found.append((worker, worker.case, worker.take(line)))
+            found.append(worker.take(line))
         except Empty:
             pass
         if time.monotonic() - self.looked > POLL:
             self.looked = time.monotonic()
-            found += [(worker, worker.case, worker.overdue()) for worker in list(self.tries)]
-        return [
-            (case, self.tries.pop(worker), result)
-            for worker, case, result in found
-            if case is not None and result is not None
-        ]
+            found += [worker.overdue() for worker in self._busy()]
+        return [one for one in found if one is not None]
 
     def _close(self) -> None:
         for worker in self.workers:
             if worker is not None:
                 worker.close()
         self.workers = [None] * len(self.workers)
-        self.tries.clear()
         self.later.clear()

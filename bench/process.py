@@ -1,4 +1,4 @@
-"""A worker process as the runner sees it: started, given one case at a time, watched, and ended."""
+"""A worker process as the runner sees it: started, handed cases, watched, and ended."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 import uuid
+from collections import deque
 from queue import SimpleQueue
 from typing import Any
 
@@ -27,6 +28,8 @@ from latticebench.bench.worker import LENGTH, MOST_BYTES, one_line, outcome, too
 START = "import sys; sys.path[:] = sys.argv[1].split('\\n'); from latticebench.bench.worker import serve; serve()"
 # Seconds until a new worker has imported what it needs.
 START_LIMIT = 120.0
+# Seconds within which a case is so quick that another one may wait behind it.
+QUICK = 0.1
 # Characters of what a case has printed that are shown in its row; bytes that are kept of it while it runs.
 MOST_SHOWN = 200
 MOST_PRINTED = 2**20
@@ -39,15 +42,17 @@ class Process:
 
     Attributes:
         code: what code of a user's it runs (see `bench.pool.foreign`); a worker is kept for cases of the same.
-        case: what it is on; None while it waits.
+        cases: what it is on, and behind that what it has been handed beforehand; empty while it waits.
     """
 
     def __init__(self, code: str, events: Events, guardian: Guardian) -> None:
         """Start it; what it answers, line by line and at its end nothing, is put into `events`."""
         self.code = code
-        self.case: Case | None = None
-        self.number, self.since, self.begun = 0, 0.0, False
-        self.kept = ""
+        self.cases: deque[Case] = deque()
+        self.number, self.since, self.begun = 1, 0.0, False
+        self.quick = self.last = False
+        # Where in the file what the present case prints begins, and what of it is in the file no more.
+        self.place, self.kept = 0, ""
         self.mark = uuid.uuid4().hex
         self.printed = _nameless_file()
         self.process = subprocess.Popen(
@@ -68,22 +73,41 @@ class Process:
                 events.put((self, line))
         events.put((self, b""))
 
-    def start(self, case: Case, folders: Folders) -> None:
-        """Hand a case to the worker."""
+    def hand(self, case: Case, folders: Folders) -> None:
+        """Hand a case to the worker, which begins with it when it has done those before."""
         assert self.process.stdin is not None
-        self.case, self.begun, self.since = case, False, time.monotonic()
-        self.number += 1
-        self.printed.truncate(0)
-        self.kept = ""
-        request = pickle.dumps((self.number, case, folders))
-        # A worker that has ended is found out by `late`.
+        if not self.cases:
+            self.since = time.monotonic()
+        self.cases.append(case)
+        request = pickle.dumps((case, folders))
+        # A worker that has ended is found out by `overdue`.
         with contextlib.suppress(OSError):
             self.process.stdin.write(len(request).to_bytes(LENGTH, "big") + request)
             self.process.stdin.flush()
 
-    def take(self, line: bytes) -> dict[str, Any] | None:
-        """Take a line that the worker has answered; return the result of the case where it is one."""
-        if self.case is None or not line:
+    @property
+    def takes_another(self) -> bool:
+        """Whether a case can wait behind the one that it is on, which saves waking it for each of many quick ones."""
+        # What a case of a user's leaves running must have ended before the next begins.
+        return self.quick and len(self.cases) == 1 and not (self.code or self.last or self.closed)
+
+    def give_back(self) -> Case | None:
+        """Take back the case behind the one that it is on, if that takes its time; the worker ends with that one."""
+        if len(self.cases) < 2 or time.monotonic() - self.since < QUICK:
+            return None
+        self.last = True
+        return self.cases.pop()
+
+    def lost(self) -> list[Case]:
+        """Take back what it had not begun when it was ended."""
+        lost = list(self.cases) if self.closed else []
+        if lost:
+            self.cases.clear()
+        return lost
+
+    def take(self, line: bytes) -> tuple[Case, dict[str, Any]] | None:
+        """Take a line that the worker has answered; return the case and its result where it is one."""
+        if self.closed or not self.cases or not line:
             return None
         try:
             told = json.loads(line)
@@ -92,19 +116,20 @@ class Process:
                 return None
             if told["done"] != self.number:
                 return None
-            result, clean = dict(told["result"]), bool(told["clean"])
-            blank = outcome(self.case, "ok")
+            result, clean, printed = dict(told["result"]), bool(told["clean"]), int(told["printed"])
+            blank = outcome(self.cases[0], "ok")
             if result.keys() != blank.keys() or result["status"] not in STATUSES or type(result["reason"]) is not str:
                 raise ValueError("another form")
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            result, clean = outcome(self.case, "failed", "what the worker answered is no result"), False
-        return self._finish(result, keep=clean)
+            result, clean = outcome(self.cases[0], "failed", "what the worker answered is no result"), False
+            printed = None
+        return self._finish(result, printed, keep=clean)
 
-    def overdue(self) -> dict[str, Any] | None:
-        """Return the result of a case that has passed a limit, or whose worker has ended; None while it runs."""
-        if self.case is None:
+    def overdue(self) -> tuple[Case, dict[str, Any]] | None:
+        """Return a case that has passed a limit, or whose worker has ended, with its result; None while it runs."""
+        if self.closed or not self.cases:
             return None
-        case, code = self.case, self.process.poll()
+        case, code = self.cases[0], self.process.poll()
         limit = case.time_limit if self.begun else START_LIMIT
         if code is not None:
             return self._finish(outcome(case, "died", f"the worker process ended by itself ({_told(code)})"))
@@ -114,25 +139,43 @@ class Process:
         if resident_mib(self.process.pid, whole=bool(self.code)) > case.memory_limit:
             return self._finish(outcome(case, "memory", too_much(case)))
         if self.printed.seek(0, os.SEEK_END) > MOST_PRINTED:
-            self.kept = self._tail()
+            self.kept, self.place = self._tail(None), 0
             self.printed.truncate(0)
         return None
 
-    def _finish(self, result: dict[str, Any], *, keep: bool = False) -> dict[str, Any]:
-        """Return the result with what was printed; the worker lives on if the case has left nothing behind."""
-        text = self._tail() if self.code or result["status"] not in ("ok", "skipped") else ""
+    def _finish(
+        self, result: dict[str, Any], printed: int | None = None, *, keep: bool = False
+    ) -> tuple[Case, dict[str, Any]]:
+        """Return the present case and its result with what was printed; turn to the next.
+
+        The worker lives on if the case has left nothing behind.
+
+        Args:
+            result: without what was printed.
+            printed: where in the file it ends, if not with the file.
+            keep: whether the worker itself is as before.
+        """
+        text = self._tail(printed) if self.code or result["status"] not in ("ok", "skipped") else ""
         if text:
             result["reason"] = f"{result['reason']}; " * bool(result["reason"]) + f"printed: {text}"
-        self.case = None
         if self.code and not (keep and result["status"] == "ok" and not descendants(self.process.pid)):
             keep = False
-        if not keep:
+        now = time.monotonic()
+        self.quick = now - self.since < QUICK
+        self.number += 1
+        self.since, self.place, self.kept = now, printed or 0, ""
+        if not keep or self.last:
             self.close()
-        return result
+        return self.cases.popleft(), result
 
-    def _tail(self) -> str:
-        self.printed.seek(max(0, self.printed.seek(0, os.SEEK_END) - 8 * MOST_SHOWN))
-        words = " ".join([self.kept, *self.printed.read(8 * MOST_SHOWN).decode(errors="replace").split()]).strip()
+    def _tail(self, until: int | None) -> str:
+        """Return the end of what the present case has printed up to a place in the file, its end if None."""
+        size = self.printed.seek(0, os.SEEK_END)
+        end = size if until is None else min(max(until, 0), size)
+        # A file that has been emptied meanwhile begins anew.
+        start = max(self.place if self.place <= end else 0, end - 8 * MOST_SHOWN)
+        self.printed.seek(start)
+        words = " ".join([self.kept, *self.printed.read(end - start).decode(errors="replace").split()]).strip()
         return one_line(words if len(words) <= MOST_SHOWN else "..." + words[3 - MOST_SHOWN :], MOST_SHOWN)
 
     @property
@@ -142,7 +185,6 @@ class Process:
 
     def close(self) -> None:
         """End the worker with all that it has started, whatever they are doing."""
-        self.case = None
         if self.closed:
             return
         end(self.process.pid, self.mark)

@@ -31,10 +31,13 @@ def serve() -> None:
     """
     requests, answers = _own_pipes()
     adopt_orphans()
-    own = os.getpid()
+    own, number = os.getpid(), 0
     while head := requests.read(LENGTH):
-        number, case, folders = pickle.loads(requests.read(int.from_bytes(head, "big")))
-        _answer(answers, {"begun": number})
+        case, folders = pickle.loads(requests.read(int.from_bytes(head, "big")))
+        number += 1
+        # The first case has waited for this process to start; each later one is taken as it comes.
+        if number == 1:
+            _answer(answers, {"begun": number})
         threads = threading.active_count()
         result = attempt(case, folders)
         for stream in (sys.stdout, sys.stderr):
@@ -43,7 +46,9 @@ def serve() -> None:
         # A copy of this process that the case has made ends here.
         if os.getpid() != own:
             os._exit(0)
-        _answer(answers, {"done": number, "result": result, "clean": threading.active_count() <= threads})
+        printed = os.fstat(2).st_size
+        clean = threading.active_count() <= threads
+        _answer(answers, {"done": number, "result": result, "clean": clean, "printed": printed})
     # A thread that a case has left must not hold the end up.
     os._exit(0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import pkgutil
 from pathlib import Path
@@ -24,6 +25,11 @@ RENAMED = {"pinn-vp": "pielm"}
 
 def registered() -> dict[str, type[Method]]:
     """Return every method of this package by its name: what the modules list in `METHODS`."""
+    return dict(_own())
+
+
+@functools.cache
+def _own() -> dict[str, type[Method]]:
     found: dict[str, type[Method]] = {}
     for info in pkgutil.iter_modules(__path__):
         module = importlib.import_module(f"{__name__}.{info.name}")

@@ -6,6 +6,7 @@ Systems Using PINNs; its equations, libraries, initial states and sampling are w
 
 from __future__ import annotations
 
+import functools
 import importlib
 import pkgutil
 from pathlib import Path
@@ -23,9 +24,14 @@ def names() -> list[str]:
     """Return the names of all systems of this package, one per module that defines `SYSTEM`."""
     return sorted(
         module.SYSTEM.name
-        for info in pkgutil.iter_modules(__path__)
-        if hasattr(module := importlib.import_module(f"{__name__}.{info.name}"), "SYSTEM")
+        for name in _modules()
+        if hasattr(module := importlib.import_module(f"{__name__}.{name}"), "SYSTEM")
     )
+
+
+@functools.cache
+def _modules() -> tuple[str, ...]:
+    return tuple(info.name for info in pkgutil.iter_modules(__path__))
 
 
 def brought() -> dict[str, EntryPoint]:
@@ -52,8 +58,8 @@ def find(name: str, base: Path | None = None) -> System:
 
     if name.endswith((".py", ".toml")):
         return load_system((base or Path()) / name)
-    for info in pkgutil.iter_modules(__path__):
-        system = getattr(importlib.import_module(f"{__name__}.{info.name}"), "SYSTEM", None)
+    for module in _modules():
+        system = getattr(importlib.import_module(f"{__name__}.{module}"), "SYSTEM", None)
         if system is not None and system.name == name:
             return system  # type: ignore[no-any-return]
     others = brought()

@@ -41,7 +41,7 @@ class Term:
 
     def __post_init__(self) -> None:
         """Check the text; the SymPy expression is made when it is needed."""
-        parse(self.text)
+        _plain(self.text)
 
     def __str__(self) -> str:
         """Return the text."""
@@ -66,8 +66,7 @@ class Term:
     @property
     def names(self) -> frozenset[str]:
         """The names that occur, among u, v, f, t, n, i, pi and the functions."""
-        bare = ast.walk(_without_indices(parse(self.text)))
-        return frozenset(node.id for node in bare if isinstance(node, ast.Name))
+        return _names(self.text)
 
     @property
     def jumps(self) -> bool:
@@ -151,21 +150,19 @@ def _sites(text: str) -> frozenset[tuple[str, int]]:
     )
 
 
+@functools.lru_cache(maxsize=4096)
+def _names(text: str) -> frozenset[str]:
+    tree = parse(text)
+    # The n of an index is no site number.
+    indices = {part for node in ast.walk(tree) if isinstance(node, ast.Subscript) for part in ast.walk(node.slice)}
+    return frozenset(node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and node not in indices)
+
+
 def _abs_of_product(argument: sympy.Expr) -> sympy.Expr:
     """Return |a b ...| as |a| |b| ..., which SymPy leaves as it is."""
     import sympy
 
     return sympy.Mul(*(sympy.Abs(factor) for factor in sympy.Mul.make_args(argument)))
-
-
-def _without_indices(tree: ast.expr) -> ast.expr:
-    """Return a copy of a tree with u in place of u[n+1], so that the n of an index is no site number."""
-
-    class Bare(ast.NodeTransformer):
-        def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
-            return node.value
-
-    return Bare().visit(ast.parse(ast.unparse(tree), mode="eval").body)  # type: ignore[no-any-return]
 
 
 def split(text: str) -> tuple[Term, ...]:
