@@ -54,28 +54,26 @@ def _basis(t: ndarray, size: int, degree: int) -> BSplines:
     return BSplines.clamped(np.interp(np.linspace(0, 1, size - degree + 1), np.linspace(0, 1, len(t)), t), degree)
 
 
-def _least_squares(basis: BSplines, t: ndarray, fields: Sequence[ndarray]) -> tuple[ndarray, ndarray, int]:
-    """Fit u and v, each in units of its spread.
-
-    Returns:
-        the coefficients, the sums of squares that are left, and how many numbers were observed.
-    """
-    designs = [basis.design(t, level) for level in range(len(fields))]
+def _least_squares(basis: BSplines, t: ndarray, fields: Sequence[ndarray]) -> tuple[ndarray, float]:
+    """Fit u and v, each in units of its spread; return the coefficients and the sum of squares that is left."""
     scales = [max(float(np.nanstd(one)), 1e-12) for one in fields]
-    splines = np.zeros((basis.count, fields[0].shape[1]))
-    left, seen = np.zeros(fields[0].shape[1]), 0
-    for column in range(fields[0].shape[1]):
-        known = [np.isfinite(one[:, column]) for one in fields]
-        matrix = np.concatenate([d[k] / s for d, k, s in zip(designs, known, scales, strict=True)])
-        target = np.concatenate([f[k, column] / s for f, k, s in zip(fields, known, scales, strict=True)])
-        splines[:, column] = np.linalg.lstsq(matrix, target, rcond=1e-5)[0]
-        left[column] = np.sum((target - matrix @ splines[:, column]) ** 2)
-        seen += len(target)
-    return splines, left, seen
+    matrix = np.concatenate([basis.design(t, level) / scale for level, scale in enumerate(scales)])
+    target = np.concatenate([one / scale for one, scale in zip(fields, scales, strict=True)])
+    splines, left = np.zeros((basis.count, target.shape[1])), 0.0
+    known = np.isfinite(target)
+    for one in np.unique(known, axis=1).T:
+        alike = np.flatnonzero(np.all(known == one[:, None], axis=0))
+        wanted = target[np.ix_(one, alike)]
+        splines[:, alike] = np.linalg.lstsq(matrix[one], wanted, rcond=1e-5)[0]
+        left += float(np.sum((wanted - matrix[one] @ splines[:, alike]) ** 2))
+    return splines, left
 
 
 def _cross_validation(basis: BSplines, t: ndarray, fields: Sequence[ndarray]) -> float:
     """Return the score of generalised cross-validation; infinite where the B-splines take all the samples."""
-    splines, left, seen = _least_squares(basis, t, fields)
-    free = 1 - splines.size / max(seen, 1)
-    return float(np.log(np.sum(left) / max(seen, 1) + 1e-24) - 2 * np.log(free)) if free > 0.1 else np.inf
+    seen = max(sum(np.count_nonzero(np.isfinite(one)) for one in fields), 1)
+    free = 1 - basis.count * fields[0].shape[1] / seen
+    if free <= 0.1:
+        return np.inf
+    left = _least_squares(basis, t, fields)[1]
+    return float(np.log(left / seen + 1e-24) - 2 * np.log(free))

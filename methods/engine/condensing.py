@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 # Up to this many operations the problem is solved by orthogonal factors, beyond by normal equations.
 MAX_QR_WORK = 6e9
+# Columns that are eliminated at a time.
+PANEL = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,9 +219,13 @@ def _edge_rows(stretches: Stretches, readings: _Readings) -> ndarray | None:
     return np.concatenate(blocks)
 
 
-def _triangular(rows: ndarray) -> ndarray:
-    """Return the factor R of rows = Q R."""
-    factor: Any = np.linalg.qr(rows, mode="r")
+def _triangular(upper: ndarray, rows: ndarray) -> ndarray:
+    """Return the factor R of Q R = rows below those of `upper`, which is triangular: LAPACK leaves out its zeros."""
+    from scipy.linalg.lapack import dtpqrt
+
+    if len(rows) == 0:
+        return upper
+    factor: Any = dtpqrt(0, min(PANEL, len(upper)), upper, rows)[0]
     return np.asarray(factor)
 
 
@@ -254,17 +260,16 @@ class _Triangle:
 
     def __init__(self, columns: int) -> None:
         self.columns = columns
-        self.kept = [np.empty((0, columns + 1))]
-        self.waiting = 0
+        self.upper = np.zeros((columns + 1, columns + 1))
+        self.waiting: list[ndarray] = []
         # The rows of each number when it was last seen.
         self.last: Any = 0.0
 
     def add_rows(self, rows: ndarray) -> None:
-        self.kept.append(rows)
-        self.waiting += len(rows)
-        if self.waiting > 6 * self.columns:
-            self.kept = [_triangular(np.concatenate(self.kept))]
-            self.waiting = len(self.kept[0])
+        self.waiting.append(rows)
+        if sum(map(len, self.waiting)) > 6 * self.columns:
+            self.upper = _triangular(self.upper, np.concatenate(self.waiting))
+            self.waiting = []
 
     def add(self, z: ndarray, readings: _Readings) -> None:
         """Add the samples at B times: z (B, columns + 1, S), readings (B, S)."""
@@ -290,13 +295,13 @@ class _Triangle:
         from scipy.linalg import solve_triangular
 
         own = self.columns - terms
-        rows = np.concatenate(self.kept)
-        scale = np.linalg.norm(rows[:, :-1], axis=0)
+        rows = np.concatenate([np.zeros((0, self.columns + 1)), *self.waiting])
+        scale = np.linalg.norm(np.concatenate([self.upper, rows])[:, :-1], axis=0)
         scale[scale == 0] = 1.0
         # What the samples do not determine at all stays where it is.
         ridge = np.zeros((own, self.columns + 1))
         ridge[np.arange(own), np.arange(own)] = 1e-9 * scale[:own]
-        factor = _triangular(np.concatenate([rows, ridge]))
+        factor = _triangular(self.upper, np.concatenate([rows, ridge]))
         upper, coupled, aim = factor[:own, :own], factor[:own, own:-1], factor[:own, -1]
 
         def solve(change: ndarray) -> ndarray:

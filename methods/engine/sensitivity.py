@@ -433,9 +433,13 @@ def _spread(grouped: ndarray, dynamics: Dynamics, colours: int, far: int) -> lis
     into, out = np.meshgrid(np.arange(blocks), np.arange(blocks), indexing="ij")
     rows = (into[None] * count + pairs.source[:, None, None]).ravel()
     columns = (out[None] * count + pairs.target[:, None, None]).ravel()
+    # All stretches have their entries in the same places, which are sorted once.
+    order = np.lexsort((columns, rows))
+    indices = columns[order].astype(np.int32)
+    pointers = np.searchsorted(rows[order], np.arange(dynamics.size + 1)).astype(np.int32)
+    entries = np.moveaxis(pairs.entries, 1, 0).reshape(len(grouped), -1)[:, order]
     shape = (dynamics.size, dynamics.size)
-    every = range(len(grouped))
-    return [scipy.sparse.csr_array((pairs.entries[:, k].ravel(), (rows, columns)), shape=shape) for k in every]
+    return [scipy.sparse.csr_array((one, indices, pointers), shape=shape) for one in entries]
 
 
 def _spread_dense(grouped: ndarray, dynamics: Dynamics, colours: int, far: int) -> ndarray | None:
