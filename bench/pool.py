@@ -58,8 +58,6 @@ class Pool:
         self.folders, self.guardian = Folders(), Guardian()
         self.workers: list[Process | None] = [None] * size
         self.later: deque[tuple[float, Case]] = deque()
-        # How many workers died while they were on a case, by its identity.
-        self.deaths: Counter[str] = Counter()
         self.looked = 0.0
 
     def __enter__(self) -> Pool:
@@ -99,6 +97,8 @@ class Pool:
         queue = deque(sorted(cases, key=foreign))
         self.folders = folders
         ended: list[tuple[Case, dict[str, Any]]] = []
+        # How many workers died while they were on a case, by its identity.
+        deaths: Counter[str] = Counter()
         try:
             while queue or self.later or self._busy() or ended:
                 try:
@@ -109,8 +109,8 @@ class Pool:
                         keep(*ended.pop())
                 pulse()
                 for case, result in self._results():
-                    if result["status"] == "died" and self.deaths[case.identity] < TRIES - 1:
-                        self.deaths[case.identity] += 1
+                    if result["status"] == "died" and deaths[case.identity] < TRIES - 1:
+                        deaths[case.identity] += 1
                         queue.appendleft(case)
                     else:
                         ended.append((case, result))
@@ -131,7 +131,7 @@ class Pool:
         if not queue and len(busy) < len(self.workers):
             # What waits behind a case that takes its time is for those that have none.
             queue.extend(case for worker in busy if (case := worker.give_back()) is not None)
-        for place in range(len(self.workers)):
+        for place in sorted(range(len(self.workers)), key=lambda place: self.workers[place] in busy):
             while queue and self._room(place, queue[0]):
                 case = queue.popleft()
                 turn = ask(case)
