@@ -15,6 +15,7 @@ from latticebench.bench.against import against
 from latticebench.bench.paired import UNDECIDED
 from latticebench.bench.publish import format_number
 from latticebench.bench.tables import read_cases
+from latticebench.bench.trials.laboratory.tables import nothing_missing
 from latticebench.methods.engine.integrated_equation import PRICE, SPAN
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -77,21 +78,33 @@ def test_the_page_on_the_limit_says_what_the_table_of_efficiencies_says(script: 
             assert f"`{method}` {counts.ends(group['efficiency'])}" in text, (part, method)
 
 
-def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings_say() -> None:
-    def share(text: str) -> str:
-        """Return "97.4 (92.6-99.1) of 115" as the page has it."""
-        found = re.fullmatch(r"(\S+) \((\S+)-(\S+)\) of (\d+)", text)
-        assert found, text
-        value, low, high = (float(one) for one in found.groups()[:3])
-        return f"{value:.0f} % ({low:.0f}-{high:.0f}) of {found[4]}"
+def share(text: str, digits: int = 0) -> str:
+    """Return a share such as "97.4 (92.6-99.1) of 115" as the page has it."""
+    found = re.fullmatch(r"(\S+) \((\S+)-(\S+)\) of (\d+)", text)
+    assert found, text
+    value, low, high = (f"{float(one):.{digits}f}" for one in found.groups()[:3])
+    return f"{value} % ({low}-{high}) of {found[4]}"
 
+
+def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings_say() -> None:
     summary = pd.read_csv(RESULTS / "loop" / "laboratory" / "summary.csv", comment="#", dtype=str)
     every = summary[summary["by"] == "all"].iloc[0]
     for column in ("right", "residual at most 1.3", "intervals that hold", "forecast worse"):
         assert f"| {share(every[column])} |" in words("diagnosis"), column
     exact = share(every["right"])
-    short = f"{exact.split(' (')[0]} of {exact.split()[-1]} laboratory recordings"
-    assert short in " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
+    readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
+    assert f"{exact.split(' (')[0]} of {exact.split()[-1]} laboratory recordings" in readme
+
+
+def test_the_page_on_the_diagnosis_says_what_the_table_of_recordings_that_lack_nothing_says() -> None:
+    frame = pd.read_csv(RESULTS / "loop" / "nothing-missing" / "laboratory.csv", comment="#")
+    every = nothing_missing(frame).iloc[0]
+    assert every["no answer"] == 0
+    for column in ("false alarms", "unexplained"):
+        assert f"| {share(every[column], digits=1)} |" in words("diagnosis"), column
+    exact = share(every["false alarms"], digits=1)
+    readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
+    assert f"it names something in {exact.split(' (')[0]} of {exact.split()[-1]} " in readme
 
 
 def test_the_page_on_methods_says_what_the_table_of_limits_says(script: Callable[[str], ModuleType]) -> None:
