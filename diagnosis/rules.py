@@ -36,7 +36,7 @@ MOST_EFFECTS = 8
 EQUAL = 3.0
 # Influences with a frequency or a time of their own are looked for on horizons of so many periods of the main
 # frequency: on shorter ones they stand in for whatever is missing. Where a sensor shows plainly that something is
-# still missing, they are looked for at once.
+# still missing, or where no model can be followed further, they are looked for at once.
 PERIODS = 3.0
 # Horizons begin at this share of the shortest period, where a wrong equation can follow, too.
 FIRST_HORIZON = 0.5

@@ -79,6 +79,7 @@ class Search:
         """Yield what was found on each horizon, from short pieces to whole recordings."""
         done: tuple[Horizon, ...] = ()
         last: Found | None = None
+        stuck = False
         shortest = 2 * np.pi / self.problem.top / self.problem.step
         length = max(int(rules.FIRST_HORIZON * shortest), self._least)
         carried = self._first(length)
@@ -89,7 +90,7 @@ class Search:
             whole = length >= self._longest
             waves = length * self.problem.step * self.problem.main / (2 * np.pi)
             strays = last is not None and misfits(self.problem, last.models[0], anywhere=True)
-            late = whole or waves >= rules.PERIODS or strays
+            late = whole or stuck or waves >= rules.PERIODS or strays
             self.open = tuple(one for one in self.problem.candidates if late or not one.timed)
             before, fits = carried[0], list(carried[1:])
             self.say(f"following pieces of {waves:.3g} periods")
@@ -106,7 +107,11 @@ class Search:
                 self.problem, further = finer, [self._longest]
                 self.say("taking away what rounding adds to the readings")
             each = ((self._carried(last, one), one) for one in further)
-            carried, length = next((pair for pair in each if pair[0]), ([], 0))
+            here = [] if late else [before, *best]
+            carried, length = next((pair for pair in each if pair[0]), (here, length))
+            stuck = bool(carried) and carried is here
+            if stuck:
+                self.say("no model can be followed further: looking for what acts at times of its own, too")
 
     def _at_once(self, first: list[Fitted]) -> list[Fitted]:
         """Return the first fits on the longest pieces if the declared equation alone nearly follows these.

@@ -1,0 +1,48 @@
+"""The search: what is looked for on which horizon."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.problem import Problem
+from latticebench.diagnosis.repair import diagnose
+from latticebench.diagnosis.search import Search
+from latticebench.systems.effects import CATALOGUE
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """Forty periods of u'' = -u - 0.02 u' + 0.3 cos(0.6 t) + noise, declared without friction and without the force."""
+    t = np.linspace(0, 80 * np.pi, 800)
+
+    def rate(t, y):
+        return [y[1], -y[0] - 0.02 * y[1] + 0.3 * np.cos(0.6 * t)]
+
+    u = solve_ivp(rate, t[[0, -1]], [1.0, 0.0], t_eval=t, rtol=1e-10, atol=1e-12).y[:1].T
+    return Samples(t, u + 0.05 * np.random.default_rng(5).normal(size=u.shape), source="spring", ends="free")
+
+
+SPRING = library("spring", "u[n]")
+
+
+def test_where_no_model_can_be_followed_further_what_acts_at_times_of_its_own_is_looked_for(driven, monkeypatch):
+    monkeypatch.setattr(Search, "_carried", lambda *_: [])
+    first, second = Search(Problem.of(SPRING, 2, [driven], CATALOGUE), lambda _: None).horizons()
+    assert second.horizons[0].periods == second.horizons[1].periods < rules.PERIODS
+    assert "drive" not in [one.effect.name for one in first.models[0].model.effects]
+    assert "drive" in [one.effect.name for one in second.models[0].model.effects]
+
+
+@pytest.mark.slow
+def test_a_strong_force_below_the_motions_own_frequency_is_named(driven):
+    found = diagnose(SPRING, 2, [driven], CATALOGUE)
+    force, friction = found.findings
+    assert found.verdict == "explained"
+    assert force.name == "drive"
+    assert force.placed.frequency == pytest.approx(0.6, abs=0.001)
+    assert "damping" in (friction.name, *friction.alternatives)
