@@ -146,6 +146,11 @@ CATALOGUE: tuple[Effect, ...] = (
         look_for="amplitudes that fall along a straight line, to a stop", source=NAYFEH,
     ),
     Effect(
+        "nonlinear-damping", "u[n]**2*v[n]", complex_field="abs(u[n])**2*v[n]", orders=(2,), real=True,
+        look_for="friction that grows with the displacement; a swing of its own where friction at rest is negative",
+        source="van der Pol, Phil. Mag. 2, 978 (1926)",
+    ),
+    Effect(
         "onsite-linear", "u[n]",
         look_for="one frequency shift for all sizes and wavelengths", source=BRAUN,
     ),
@@ -185,6 +190,11 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "next-neighbour", "u[n+2]+u[n-2]-2*u[n]",
         look_for="short waves off by more than long ones, alike at all sizes", source=BRAUN,
+    ),
+    Effect(
+        "quadratic-coupling", "(u[n+1]-u[n])**2-(u[n-1]-u[n])**2", complex_field="",
+        look_for="springs that are stiffer stretched than pressed, or the other way round",
+        source="Fermi, Pasta & Ulam, Studies of Nonlinear Problems, Los Alamos LA-1940 (1955)",
     ),
     Effect(
         "nonlinear-coupling", "(u[n+1]-u[n])**3+(u[n-1]-u[n])**3",

@@ -58,14 +58,12 @@ SECOND_ORDER = (
     "other: cubic-drag",
     "other: friction-between",
     "other: wavy-drag",
-    "other: lopsided-bonds",
-    "other: bent-damper",
     # For order 1 this would be disorder, and the next one asymmetric coupling.
     "other: absorbing-ends",
     "other: gyroscopic-bonds",
 )
 COMPLEX = ("other: phase-conjugation", "other: nonlocal-response")
-REAL = ("damping", "nonlinear-loss", "gain-loss", "disorder")
+REAL = ("damping", "nonlinear-damping", "nonlinear-loss", "gain-loss", "disorder")
 
 
 def _pushing(names: dict[str, Callable[[pushes.Moment], np.ndarray]]) -> dict[str, Fault]:

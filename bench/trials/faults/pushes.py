@@ -137,6 +137,7 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "damping": lambda m: -m.v,
     "quadratic-drag": lambda m: -np.abs(m.v) * m.v,
     "dry-friction": lambda m: -np.sign(m.v),
+    "nonlinear-damping": lambda m: -(np.abs(m.u) ** 2) * m.v,
     "onsite-linear": lambda m: m.u,
     "onsite-quadratic": lambda m: (np.abs(m.u) if m.chain.is_complex else m.u) * m.u,
     "onsite-cubic": lambda m: np.abs(m.u) ** 2 * m.u,
@@ -148,6 +149,7 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "trap": lambda m: m.drawn.n**2 * m.u,
     "kick": lambda m: m.pulse() * np.ones(len(m.u)),
     "next-neighbour": lambda m: m.stretch(2) + m.stretch(-2),
+    "quadratic-coupling": lambda m: m.stretch(1) ** 2 - m.stretch(-1) ** 2,
     "nonlinear-coupling": lambda m: (
         np.abs(m.stretch(1)) ** 2 * m.stretch(1) + np.abs(m.stretch(-1)) ** 2 * m.stretch(-1)
     ),
@@ -180,7 +182,6 @@ PLAIN: dict[str, Callable[[Moment], ndarray]] = {
 }
 
 FIRST_BLIND: dict[str, Callable[[Moment], ndarray]] = {
-    "other: lopsided-bonds": lambda m: m.stretch(1) ** 2 - m.stretch(-1) ** 2,
     "other: moving-spot": lambda m: m.spot() * m.u,
     "other: plane-wave": lambda m: m.travelling(),
     "other: phase-conjugation": lambda m: np.conj(m.u),
@@ -195,7 +196,6 @@ THIRD_BLIND: dict[str, Callable[[Moment], ndarray]] = {
     "other: pumped-coupling": lambda m: m.wave() * (m.stretch(1) + m.stretch(-1)),
     "other: three-body": lambda m: m.neighbour(1) * np.conj(m.u) * m.neighbour(-1),
     "other: unsteady-supply": lambda m: m.supply() * m.u,
-    "other: bent-damper": lambda m: -(np.abs(m.u) ** 2) * m.v,
 }
 
 FOURTH_BLIND: dict[str, Callable[[Moment], ndarray]] = {

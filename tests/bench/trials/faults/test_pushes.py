@@ -56,9 +56,9 @@ def truth_of(name):
     "effect",
     [
         "damping", "drive", "defect", "bond-defect", "next-neighbour", "unequal-masses", "gradient",
-        "other: lopsided-bonds", "other: moving-spot",
+        "quadratic-coupling", "other: moving-spot",
         "other: plane-wave", "other: stray-wire", "other: pumped-coupling", "local-drive", "other: three-body",
-        "other: bent-damper", "other: end-stops", "other: sweeping-drive", "local-damping", "local-kick",
+        "nonlinear-damping", "other: end-stops", "other: sweeping-drive", "local-damping", "local-kick",
         "other: one-way-bond", "other: self-steepening", "other: absorbing-ends", "other: gyroscopic-bonds",
         "other: shared-load",
         "other: ticking-pump",
@@ -88,7 +88,7 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
         "next-neighbour": lambda _t, u, _v: far(u),
         "unequal-masses": lambda _t, u, _v: at * own(u),
         "gradient": lambda _t, u, _v: n + 0 * u,
-        "other: lopsided-bonds": lambda _t, u, _v: np.diff(u, append=u[-1]) ** 2 - np.diff(u, prepend=u[0]) ** 2,
+        "quadratic-coupling": lambda _t, u, _v: np.diff(u, append=u[-1]) ** 2 - np.diff(u, prepend=u[0]) ** 2,
         "other: moving-spot": lambda t, u, _v: (
             np.exp(-0.5 * ((n - about["spot"] - about["speed"] * (t - np.mean(one.clean.t))) / about["breadth"]) ** 2)
             * u
@@ -98,7 +98,7 @@ def test_a_motion_is_that_of_an_equation_written_by_hand(effect):
         "other: pumped-coupling": lambda t, u, _v: wave(t) * (neighbours(u) - 2 * u),
         "local-drive": lambda t, _u, _v: wave(t) * at,
         "other: three-body": lambda _t, u, _v: np.append(u[1:], u[-1]) * u * np.append(u[0], u[:-1]),
-        "other: bent-damper": lambda _t, u, v: -(u**2) * v,
+        "nonlinear-damping": lambda _t, u, v: -(u**2) * v,
         "other: end-stops": lambda _t, u, _v: -(u - np.clip(u, begin - about["play"], begin + about["play"])),
         "other: sweeping-drive": lambda t, u, _v: rising(about, t) + 0 * u,
         "local-damping": lambda _t, _u, v: -at * v,
