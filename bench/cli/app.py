@@ -7,7 +7,6 @@ packages are imported inside the function, so that `--help`, `list` and tab comp
 from __future__ import annotations
 
 import errno
-import io
 import os
 import sys
 import warnings
@@ -36,6 +35,7 @@ from latticebench.bench.cli import (
     status,
     table,
 )
+from latticebench.bench.cli.streams import lead_nowhere, settle
 from latticebench.bench.threads import prefer_one_thread
 from latticebench.systems.errors import InputError, printable
 from latticebench.systems.files import LARGEST
@@ -70,6 +70,10 @@ def program(
     ] = None,
 ) -> None:
     """Find the equations of motion of nonlinear lattices from data, and measure how well each method does it."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise InputError(f"the working folder cannot be used: {error.strerror}; change to one that exists") from None
     if largest_file is not None:
         # The environment, since worker processes read files, too.
         os.environ[LARGEST] = str(largest_file)
@@ -96,12 +100,10 @@ app.command(epilog=schema.EPILOG)(schema.schema)
 
 def main() -> None:
     """Run the command line; bad input is one line on standard error and exit code 2."""
+    settle()
     prefer_one_thread()
-    # What NumPy remarks on its way to a refusal is no help to anybody; a file's name may be of any bytes.
+    # What NumPy remarks on its way to a refusal is no help to anybody.
     warnings.filterwarnings("ignore", category=RuntimeWarning)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
     try:
         code = app(standalone_mode=False)
         sys.stdout.flush()
@@ -114,13 +116,13 @@ def main() -> None:
         code = 130
     except BrokenPipeError:
         # The reader (head, a pager) has seen enough; Python would complain once more on exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        lead_nowhere()
         code = 0
     except OSError as error:
         # Files of the user's are read and written with errors of their own; what is left is standard output.
         if error.errno not in (errno.ENOSPC, errno.EIO, errno.EDQUOT, errno.EFBIG):
             raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        lead_nowhere()
         _complain(f"standard output cannot be written: {error.strerror}")
         code = 2
     except Exception as error:

@@ -162,7 +162,7 @@ class Dynamics:
         if step is not None and self._rubbing:
             found = self._softened(coefficients, values, rate[:, 0, 0], step, factors, derivatives)
         summed = np.matmul(coefficients, values.reshape(self.parts, len(self.terms), -1))
-        rate[:, -1] = np.moveaxis(summed.reshape(self.parts, *shape), 0, 1)
+        rate[:, -1] = summed.reshape(self.parts, *shape).swapaxes(0, 1)
         if derivatives:
             self._add_slopes(found, read, coefficients, factors)
         return rate.reshape(y.shape), values, found
@@ -238,6 +238,11 @@ class Dynamics:
             return ()
         return tuple(k for k, term in enumerate(self.terms) if term.jumps)
 
+    @functools.cached_property
+    def _smooth(self) -> Int[ndarray, " others"]:
+        """The numbers of the other terms."""
+        return np.delete(np.arange(len(self.terms)), self._rubbing)
+
     def _softened(
         self,
         coefficients: ndarray,
@@ -248,8 +253,9 @@ class Dynamics:
         derivatives: bool,
     ) -> dict[tuple[int, Slot], ndarray]:
         """Replace dry friction in `values` by one without a jump, and return its derivative by v."""
-        others = np.delete(np.arange(len(self.terms)), self._rubbing)
-        push = np.abs(np.tensordot(coefficients[others], values[0, others], (0, 0)))
+        others = self._smooth
+        pushes = values[0, others].reshape(len(others), v.size)
+        push = np.abs(np.dot(coefficients[None, others], pushes)).reshape(v.shape)
         total = np.zeros_like(v)
         for term in self._rubbing:
             size = np.ones_like(v) if self.weights is None else self.weights[term, self.moving] * np.ones_like(v)

@@ -290,8 +290,10 @@ class Stretches:
         slopes_y = np.empty((len(b), *y.shape))
         slopes_z = None if z is None else np.empty((len(b), *z.shape))
         for step in range(count):
-            for stage in range(len(b)):
-                t = begin + (step + c[stage]) * h
+            times = begin + (step + c[: len(b), None]) * h
+            # Of all stages at once: on short chains each call costs more than what it does.
+            curves, basis = self._at_border(times, splines, slopes=z is not None)
+            for stage, t in enumerate(times):
                 at_y, at_z = y, z
                 if stage:
                     at_y = y + h[:, None] * _combine(a[stage, :stage], slopes_y)
@@ -300,17 +302,29 @@ class Stretches:
                 # An input that is held jumps from one step to the next: each sees its own side.
                 inside = begin + (step + 0.5 + INSIDE * (c[stage] - 0.5)) * h
                 f = None if self.inputs is None else self.inputs(inside)
-                driven = self.driven(t, splines)
                 rate, values, slopes = self.dynamics.linear(
-                    coefficients, t, at_y, f, driven, derivatives=z is not None, step=h
+                    coefficients, t, at_y, f, curves and curves[stage], derivatives=z is not None, step=h
                 )
                 slopes_y[stage] = rate
                 if slopes_z is not None:
-                    self._vary_rate(slopes_z[stage], at_z, values, slopes, t, chosen, by_terms=by_terms)
+                    at = basis and basis[stage]
+                    self._vary_rate(slopes_z[stage], at_z, values, slopes, at, chosen, by_terms=by_terms)
             y = y + h[:, None] * _combine(b, slopes_y)
             if z is not None:
                 z = z + h * _combine(b, slopes_z)
         return y, z
+
+    def _at_border(
+        self, times: Float[ndarray, "stage batch"], splines: ndarray | None, *, slopes: bool
+    ) -> tuple[list[ndarray] | None, list[tuple[ndarray, ndarray, ndarray]] | None]:
+        """Return the motion of the sites without an equation and, for `slopes`, the B-splines, at times of stages."""
+        flat, stages = times.ravel(), len(times)
+        driven = self.driven(flat, splines)
+        curves = None if driven is None else list(driven.reshape(*times.shape, *driven.shape[1:]))
+        if self.drive is None or self.held or not slopes:
+            return curves, None
+        first, value, slope = (np.split(one, stages) for one in self.drive.basis(flat))
+        return curves, list(zip(first, value, slope, strict=True))
 
     def _vary_rate(
         self,
@@ -318,7 +332,7 @@ class Stretches:
         z: Any,
         values: ndarray,
         slopes: dict[tuple[int, Slot], ndarray],
-        t: ndarray,
+        basis: tuple[ndarray, ndarray, ndarray] | None,
         chosen: ndarray,
         *,
         by_terms: bool,
@@ -330,30 +344,31 @@ class Stretches:
         dynamics = self.dynamics
         order, parts, count = dynamics.order, dynamics.parts, dynamics.count
         columns, terms = len(z), len(dynamics.terms)
-        blocks = z.reshape(columns, order, parts, count, len(t))
+        batch = len(chosen)
+        blocks = z.reshape(columns, order, parts, count, batch)
         field, extra = blocks, 0
         if len(dynamics.border):
-            field = np.zeros((columns, order, parts, dynamics.sites, len(t)))
+            field = np.zeros((columns, order, parts, dynamics.sites, batch))
             field[..., dynamics.moving, :] = blocks
-        if self.drive is not None and not self.held:
+        if basis is not None:
             first, width = self._active
             border = dynamics.border
             extra = width * parts * len(border)
-            at, *curves = self.drive.basis(t)
-            place = at[:, None] - first[chosen][:, None] + np.arange(self.drive.degree + 1)
-            rows = np.arange(len(t))[:, None]
+            at, *curves = basis
+            place = at[:, None] - first[chosen][:, None] + np.arange(curves[0].shape[1])
+            rows = np.arange(batch)[:, None]
             # The columns of the drive: spline coefficient, part, site.
             for part in range(parts):
                 for number, site in enumerate(border):
                     column = columns - extra + (place * parts + part) * len(border) + number
                     for level in range(order):
                         field[column, level, part, site, rows] = curves[level]
-        target = out.reshape(columns, order, parts, count, len(t))
+        target = out.reshape(columns, order, parts, count, batch)
         if order == 2:
             target[:, 0] = blocks[:, 1]
         target[:, -1] = 0.0
         if len(slopes) > WIDE * parts**2 and not len(dynamics.border):
-            product = self._jacobian(slopes, len(t)) @ np.transpose(z, (2, 1, 0))
+            product = self._jacobian(slopes, batch) @ np.transpose(z, (2, 1, 0))
             target[:, -1] = np.transpose(product, (2, 1, 0)).reshape(target[:, -1].shape)
         else:
             padded = dynamics.stencil.pad(field, after=1)

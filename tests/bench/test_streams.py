@@ -1,0 +1,55 @@
+"""Standard streams that are closed, full or gone, and a working folder that is: each command ends in order."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from commandline import SUITE, content
+
+posix = pytest.mark.skipif(os.name != "posix", reason="closes streams as POSIX shells do")
+needs_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is full")
+
+
+def in_shell(line: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run a line of shell, in which $LB is the program."""
+    program = f"'{sys.executable}' -m latticebench"
+    return subprocess.run(["sh", "-c", line.replace("$LB", program)], cwd=cwd, capture_output=True, text=True)
+
+
+@posix
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
+def test_a_run_with_closed_streams_keeps_whole_results(closed: str, tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SUITE)
+    done = in_shell(f"$LB run s.toml --jobs 1 --results store {closed}", tmp_path)
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
+    again = in_shell("$LB run s.toml --jobs 1 --results store", tmp_path)
+    assert "4 cases (4 ok); 0 run now, 4 were there" in again.stdout
+
+
+@posix
+@needs_full
+def test_a_full_standard_error_ends_no_work_and_changes_no_exit_code(tmp_path: Path) -> None:
+    # What is printed there is a warning of many hours, which comes before any work.
+    (tmp_path / "s.toml").write_text(SUITE + "time_limit = 1e9\n")
+    long = in_shell("$LB run s.toml --yes --jobs 1 --results store 2>/dev/full", tmp_path)
+    assert long.returncode == 0
+    assert "4 cases (4 ok)" in long.stdout
+    assert in_shell("$LB fit nowhere.csv --system phi4 --library lib1 2>/dev/full", tmp_path).returncode == 2
+
+
+@posix
+def test_a_working_folder_that_is_gone_is_told_in_one_line(tmp_path: Path) -> None:
+    before = content(tmp_path)
+    done = in_shell("mkdir gone; cd gone; rmdir ../gone; $LB simulate phi4 --out x.csv", tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: the working folder cannot be used: ")
+    assert done.stderr.count("\n") == 1
+    assert content(tmp_path) == before
+    assert in_shell("mkdir gone; cd gone; rmdir ../gone; $LB --version", tmp_path).returncode == 0
