@@ -92,7 +92,7 @@ class Residual:
         return f"Residual({self.overlay.source}: {self.rms:.2g}{unit} in the mean square{noise})"
 
     def _repr_html_(self) -> str:
-        return f"<p>{html.escape(repr(self))}</p>{html_table(self.to_frame().describe(), index=True)}"
+        return f"<p>{html.escape(repr(self))}</p>{html_table(self.to_frame().drop(columns='t').describe(), index=True)}"
 
 
 @dataclass(frozen=True, eq=False)

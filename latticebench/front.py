@@ -223,7 +223,17 @@ def limit(data: Recording, model: Model, target: float = 0.01) -> Bound:
     return Bound(found.at(1, 1), design(found.at, target=target), tuple(found.note.splitlines()), tuple(found.warnings))
 
 
-def results(name: str | Path) -> Mapping[str, pd.DataFrame]:
+class Tables(dict[str, pd.DataFrame]):
+    """Published tables by name; see `results` for an example."""
+
+    def __repr__(self) -> str:
+        return f"Tables({', '.join(f'{name}: {len(frame)} rows' for name, frame in self.items())})"
+
+    def _repr_html_(self) -> str:
+        return "".join(f"<p>{html.escape(name)}</p>{html_table(frame.head())}" for name, frame in self.items())
+
+
+def results(name: str | Path) -> Tables:
     """Return the tables of a published run, or of a folder with published tables, by name.
 
     Args:
@@ -235,8 +245,8 @@ def results(name: str | Path) -> Mapping[str, pd.DataFrame]:
     Examples:
         >>> import latticebench as lb
         >>> tables = lb.results("default")
-        >>> "cases" in tables
-        True
+        >>> tables
+        Tables(cases: ... rows, coefficients: ... rows, errors: ... rows...)
         >>> tables["cases"]["e2"].dtype
         dtype('float64')
     """
@@ -249,7 +259,7 @@ def results(name: str | Path) -> Mapping[str, pd.DataFrame]:
             f"{name}: there are no published tables; give a folder with .csv files of `latticebench table`"
         )
     found = {path.stem: read_table(path) for path in paths}
-    return {key: frame.apply(_numbers) for key, frame in found.items()}
+    return Tables({key: frame.apply(_numbers) for key, frame in found.items()})
 
 
 @dataclass(frozen=True, eq=False)
