@@ -26,7 +26,7 @@ import numpy as np
 
 from latticebench.bench.noise import centred, left_by
 from latticebench.bench.overlay import motion_of
-from latticebench.diagnosis.instrument import of_readings
+from latticebench.diagnosis.instrument import of_readings, two_digits
 from latticebench.diagnosis.problem import Spectrum
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.engine.derivatives import DEGREE
@@ -106,10 +106,11 @@ class Adequacy:
         """The numbers in one line."""
         parts = []
         if np.isfinite(self.work):
-            parts.append(f"half a period ahead it leaves {100 * self.work:.2g} % of what the forces do")
+            parts.append(f"half a period ahead it leaves {two_digits(100 * self.work)} % of what the forces do")
         if np.isfinite(self.r2):
             parts.append(f"R^2 = {self.r2:.4g}" if self.r2 > -1 else "R^2 < -1")
-        parts.append("the noise is not seen" if np.isnan(self.times) else f"{self.times:.2g} times the noise is left")
+        hidden = np.isnan(self.times)
+        parts.append("the noise is not seen" if hidden else f"{two_digits(self.times)} times the noise is left")
         if self.unread:
             parts.append(f"nothing was read of {self.unread}")
         return "; ".join(parts)
@@ -304,10 +305,10 @@ def _of_unknown(terms: Sequence[str]) -> tuple[str, ...]:
 
 
 def _of_misfit(fit: Fit, work: float, times: float) -> tuple[str, ...]:
-    beyond = "" if np.isnan(times) else f", {times:.2g} times the noise of the readings"
+    beyond = "" if np.isnan(times) else f", {two_digits(times)} times the noise of the readings"
     lines = [
-        f"the equation does not fit: over half a period it leaves {100 * min(work, AWAY):.2g} % of what the forces do"
-        f"{beyond}; `latticebench diagnose` looks for what it lacks"
+        f"the equation does not fit: over half a period it leaves {two_digits(100 * min(work, AWAY))} % of what the "
+        f"forces do{beyond}; `latticebench diagnose` looks for what it lacks"
     ]
     if fit.stderr is not None:
         lines.append("standard errors hold for a right equation only; here they mean nothing")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 FILMS = (".gif", ".mp4")
 # Pictures that a film has at most, and how many are shown in a second.
 FRAMES, PER_SECOND = 240, 20
+# Inches, and dots in each.
+SIZE, DENSITY = (6.4, 3.8), 100
 
 
 def check_film(path: Path) -> None:
@@ -50,13 +52,20 @@ def animate(overlay: Overlay, path: Path, about: Mapping[str, Any]) -> None:
     Raises:
         InputError: the file cannot be written, or MP4 is asked for, and there is no ffmpeg.
     """
-    from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
+    check_film(path)
+    with whole(path) as temporary:
+        (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(
+            list(_frames(overlay)), temporary, "\n".join(lines(about))
+        )
+
+
+def _frames(overlay: Overlay) -> Iterator[np.ndarray]:
+    """Yield the pictures of a film (height, width, 3); what does not move is drawn once."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    check_film(path)
-    figure = Figure(figsize=(6.4, 3.8), layout="constrained")
+    figure = Figure(figsize=SIZE, dpi=DENSITY, layout="constrained")
     axes = figure.add_subplot()
-    rows = np.unique(np.linspace(0, len(overlay.t) - 1, min(len(overlay.t), FRAMES)).round().astype(int))
     place = np.arange(overlay.sites) + 1
     drawn = []
     for values, names, style in _moving(overlay):
@@ -66,21 +75,49 @@ def animate(overlay: Overlay, path: Path, about: Mapping[str, Any]) -> None:
             )
             drawn.append((line, values[:, part]))
     _furnish(axes, overlay)
-    # Places are the same in every picture, and finding them takes longer than drawing.
-    axes.set_title("t", fontsize=10, loc="left")
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
-
-    def show(row: int) -> list[Any]:
+    time = axes.set_title("t", fontsize=10, loc="left")
+    for one in (time, *(line for line, _ in drawn)):
+        one.set_animated(True)
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    still = canvas.copy_from_bbox(figure.bbox)
+    for row in np.unique(np.linspace(0, len(overlay.t) - 1, min(len(overlay.t), FRAMES)).round().astype(int)):
+        canvas.restore_region(still)
+        time.set_text(label(with_unit(f"t = {overlay.t[row]:.4g}", overlay.time_unit)))
+        axes.draw_artist(time)
         for line, values in drawn:
             line.set_ydata(values[row])
-        axes.set_title(label(with_unit(f"t = {overlay.t[row]:.4g}", overlay.time_unit)), fontsize=10, loc="left")
-        return [line for line, _ in drawn]
+            axes.draw_artist(line)
+        yield np.array(canvas.buffer_rgba())[..., :3]
 
-    film = FuncAnimation(figure, show, frames=rows.tolist(), blit=False, cache_frame_data=False)
-    kind = PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter
-    with whole(path) as temporary:
-        film.save(str(temporary), writer=kind(fps=PER_SECOND, metadata={"comment": "\n".join(lines(about))}), dpi=100)
+
+def _write_gif(frames: Sequence[np.ndarray], path: Path, comment: str) -> None:
+    from PIL import Image
+
+    # One palette for all, the commonest colours: finding one for each picture takes longer than drawing it.
+    some = np.stack(frames[:: max(1, len(frames) // 16)]).astype(np.int32) @ (1 << 16, 1 << 8, 1)
+    colours, counts = np.unique(some, return_counts=True)
+    common = colours[np.argsort(-counts, kind="stable")[:256]]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([int(part) for one in common for part in (one >> 16, one >> 8 & 255, one & 255)])
+    first, *others = (Image.fromarray(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in frames)
+    first.save(
+        path, format="GIF", save_all=True, append_images=others, duration=1000 // PER_SECOND, loop=0,
+        comment=comment.encode(),
+    )  # fmt: skip
+
+
+def _write_mp4(frames: Sequence[np.ndarray], path: Path, comment: str) -> None:
+    from matplotlib.animation import FFMpegWriter
+    from matplotlib.figure import Figure
+
+    shown = Figure(figsize=SIZE, dpi=DENSITY)
+    picture = shown.figimage(frames[0])
+    writer = FFMpegWriter(fps=PER_SECOND, metadata={"comment": comment})
+    with writer.saving(shown, str(path), DENSITY):
+        for one in frames:
+            picture.set_data(one)
+            writer.grab_frame()
 
 
 def _moving(overlay: Overlay) -> list[tuple[np.ndarray, tuple[str, ...], dict[str, Any]]]:

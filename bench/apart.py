@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +17,6 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
 from latticebench.systems.readers import read_all
-from latticebench.systems.samples import Samples
 from latticebench.systems.stencil import Ends
 
 # What of a fit comes back, besides its coefficients.
@@ -68,13 +66,6 @@ class Apart(Case):
         found.update(name=fit.method, note=fit.status, coefficients=fit.coefficients.tolist())
         found["stderr"] = None if fit.stderr is None else [plain(one) for one in fit.stderr]
         found.update({name: plain(getattr(fit, name)) for name in NUMBERS})
-
-
-def fit_here(case: Apart, data: Sequence[Samples], candidates: Library) -> Fit:
-    """Fit in this process, without limits; what the method prints goes to standard error."""
-    with redirect_stdout(sys.stderr):
-        method = make(methods.find(case.method), case.settings, texts=True)
-        return solve(method, data, candidates, case.order, case.seed)
 
 
 def fit_apart(case: Apart, candidates: Library) -> Fit:

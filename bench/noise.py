@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.report.units import noise_in_words, units_of
-from latticebench.diagnosis.instrument import ROBUST, of_readings, step_of
+from latticebench.diagnosis.instrument import ROBUST, of_readings, step_of, two_digits
 from latticebench.diagnosis.noise import Noise, Rows
 from latticebench.diagnosis.noise_estimate import estimate
 from latticebench.methods.engine.dynamics import split_parts
@@ -67,13 +67,13 @@ class Left:
         """What is to be said where the equation misfits, or where that cannot be told."""
         if self.misfit:
             return (
-                f"the equation leaves {self.times:.2g} times the noise: these bounds do not hold; "
+                f"the equation leaves {two_digits(self.times)} times the noise: these bounds do not hold; "
                 "see `latticebench diagnose`",
             )
         if self.times > FAR:
             return (
-                f"neighbouring readings differ by {self.times:.2g} times less than such noise without correlation: "
-                "these bounds hold if it is the instrument's; see `latticebench diagnose`",
+                f"neighbouring readings differ by {two_digits(self.times)} times less than such noise without "
+                "correlation: these bounds hold if it is the instrument's; see `latticebench diagnose`",
             )
         if np.isnan(self.times):
             return ("neighbouring readings do not show their noise, so that whether the equation fits is not known",)

@@ -230,7 +230,13 @@ def _has_fast_lines(values: Float[ndarray, " time"], order: int) -> bool:
 
 
 def describe(
-    noise: Noise, steps: Sequence[float], unit: str = "", *, interval: float | None = None, least: float = 0.0
+    noise: Noise,
+    steps: Sequence[float],
+    unit: str = "",
+    *,
+    interval: float | None = None,
+    least: float = 0.0,
+    time: str = "",
 ) -> list[str]:
     """Return the noise in words, a line for each sensor, or one line for all if they are alike.
 
@@ -240,26 +246,27 @@ def describe(
         unit: of the readings.
         interval: time from one reading to the next; with it, the correlation over it is said.
         least: the smallest size that was looked for.
+        time: unit of the times.
     """
     lines = []
-    for size, time, step in zip(noise.deviation(), noise.memory, steps, strict=True):
+    for size, memory, step in zip(noise.deviation(), noise.memory, steps, strict=True):
         most = "at most " if size < AT_LEAST * least else ""
-        parts = [f"{most}{_number(size)} {unit}".rstrip()]
+        parts = [f"{most}{two_digits(size)} {unit}".rstrip()]
         if step > COARSE * size:
-            parts.append(f"steps of {_number(step)}")
-        if time > 0:
-            near = f" ({_number(np.exp(-interval / time))} from one reading to the next)" if interval else ""
-            parts.append(f"correlated over {_number(time)}{near}")
+            parts.append(f"steps of {two_digits(step)}")
+        if memory > 0:
+            near = f" ({two_digits(np.exp(-interval / memory))} from one reading to the next)" if interval else ""
+            parts.append(f"correlated over {two_digits(memory)} {time}".rstrip() + near)
         if np.isfinite(noise.tail):
-            parts.append(f"tails of Student's t with {_number(noise.tail)} degrees of freedom")
+            parts.append(f"tails of Student's t with {two_digits(noise.tail)} degrees of freedom")
         if noise.growth > 0:
-            parts.append(f"grows with the signal by {_number(100 * noise.growth)} %")
+            parts.append(f"grows with the signal by {two_digits(100 * noise.growth)} %")
         lines.append(", ".join(parts))
     if len(lines) > 1 and all(one == other for one, other in itertools.pairwise(lines)):
         return [f"all sensors: {lines[0]}"]
     return [f"sensor {number}: {line}" for number, line in enumerate(lines, 1)]
 
 
-def _number(value: float) -> str:
+def two_digits(value: float) -> str:
     """Return a number with two digits that count."""
     return f"{float(f'{value:.2g}'):g}"

@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 
 One = TypeVar("One")
 
+# Why named effects may explain only a part.
+SMALL, NAMELESS = "something small is left", "something without a name does better"
+NOT_REACHED = "the readings are not reached"
 # Readings beyond twice the number of unknowns that a diagnosis needs.
 SPARE = 10
 
@@ -110,6 +113,15 @@ class Interrupted(Exception):
     def __init__(self, diagnosis: Diagnosis) -> None:
         super().__init__("interrupted")
         self.diagnosis = diagnosis
+
+
+def shortfalls(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Return why what is named explains only a part: SMALL, NAMELESS, NOT_REACHED; nothing with another verdict."""
+    if not diagnosis.findings or not diagnosis.left:
+        return ()
+    rivals, reached = [bool(one.instead) for one in diagnosis.left], diagnosis.residual[1] <= rules.LOST
+    found = {SMALL: reached and not all(rivals), NAMELESS: any(rivals), NOT_REACHED: not reached}
+    return tuple(words for words, holds in found.items() if holds)
 
 
 def diagnose(

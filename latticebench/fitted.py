@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from threadpoolctl import threadpool_limits
 
 from latticebench import methods
-from latticebench.bench.adequacy import Adequacy, adequacy
-from latticebench.bench.inspection import sine_warning
+from latticebench.bench import calls
+from latticebench.bench.adequacy import Adequacy
 from latticebench.bench.overlay import Overlay, of_fit
 from latticebench.bench.report.mathematics import written
 from latticebench.bench.report.rows import html_table
 from latticebench.exhibit import Exhibit
-from latticebench.methods.method import Fit, Skipped, make, solve
+from latticebench.methods.method import Fit, make
 from latticebench.pictures import Picture
 from latticebench.recording import Model, Recording
 from latticebench.systems.errors import InputError
@@ -93,7 +92,7 @@ class Residual:
         return f"Residual({self.overlay.source}: {self.rms:.2g}{unit} in the mean square{noise})"
 
     def _repr_html_(self) -> str:
-        return f"<p>{html.escape(repr(self))}</p>{html_table(self.to_frame().describe(), index=True)}"
+        return f"<p>{html.escape(repr(self))}</p>{html_table(self.to_frame().drop(columns='t').describe(), index=True)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +251,7 @@ class Fitted(Exhibit):
         return f"{lines}{told}{html_table(self.table, index=True)}<p>{html.escape(self.quality.in_words)}</p>"
 
 
-def fit(data: Recording, model: Model, method: str = "trajectory", seed: int = 1, **settings: Any) -> Fitted:
+def fit(data: Recording, model: Model, method: str = methods.DEFAULT, seed: int = 1, **settings: Any) -> Fitted:
     """Fit the coefficients of a model to a recording.
 
     Args:
@@ -276,11 +275,6 @@ def fit(data: Recording, model: Model, method: str = "trajectory", seed: int = 1
         >>> found.warnings
         ()
     """
-    samples, terms = model.of(data), model.library
-    try:
-        # On matrices of these sizes more threads are slower, up to forty times beside other work.
-        with threadpool_limits(1, user_api="blas"):
-            result = solve(make(methods.find(method), settings), samples, terms, model.order, seed)
-    except Skipped as reason:
-        raise InputError(f"method {method!r} cannot fit {samples[0].source}: {reason}; choose another") from None
-    return Fitted(result, adequacy(samples, result).also(sine_warning(samples, terms)), model, data)
+    samples = model.of(data)
+    result = calls.fit(samples, model.library, model.order, make(methods.find(method), settings), seed)
+    return Fitted(result, calls.judged(samples, result), model, data)

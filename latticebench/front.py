@@ -21,14 +21,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
-from threadpoolctl import threadpool_limits
 
+from latticebench.bench import calls
 from latticebench.bench.overlay import of_diagnosis
 from latticebench.bench.report.rows import html_table
 from latticebench.exhibit import Exhibit
-from latticebench.methods.method import Skipped
 from latticebench.recording import Model, Recording
-from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -135,24 +133,30 @@ class Cause(Exhibit):
         return f'<iframe srcdoc="{html.escape(self.page)}" style="width:100%;height:40em;border:0"></iframe>'
 
 
-def diagnose(data: Recording, model: Model) -> Cause:
-    """Find what a declared equation lacks of a recording.
+def diagnose(
+    data: Recording, model: Model, *, effects: str | Path | None = None, holdout: Recording | None = None
+) -> Cause:
+    """Find what a declared equation lacks of a recording; when interrupted, return what is known by then.
 
     Args:
         data: the recording.
         model: the declared equation.
+        effects: a .toml file with effects of your own, tried beside the catalogue.
+        holdout: a recording of the same chain to judge forecasts on; the last 30 % of `data` if not given.
 
     Returns:
         what was found; see `Cause` for an example.
 
     Raises:
-        InputError: the equation cannot be set up on it.
+        InputError: the equation cannot be set up on it, or the two recordings are not of the same chain.
     """
-    from latticebench.bench.report.content import content
-    from latticebench.diagnosis import repair
-
-    found = repair.diagnose(model.library, model.order, model.of(data), CATALOGUE)
-    return Cause(found, content(found), model)
+    every = model.of(data if holdout is None else Recording((*data.samples, *holdout.samples)))
+    count = len(data.samples)
+    found, report = calls.diagnose(
+        every[:count], model.library, model.order, effects=None if effects is None else Path(effects),
+        later=every[count:],
+    )  # fmt: skip
+    return Cause(found, report, model)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,19 +217,23 @@ def limit(data: Recording, model: Model, target: float = 0.01) -> Bound:
     Raises:
         InputError: the equation cannot be set up on the recording.
     """
-    from latticebench.bench.bounds import of_recordings
     from latticebench.bench.limit import design
 
-    samples = model.of(data)
-    try:
-        with threadpool_limits(1, user_api="blas"):
-            found = of_recordings(samples, model.library, model.order)
-    except Skipped as reason:
-        raise InputError(f"{samples[0].source}: {reason}") from None
+    found = calls.bound(model.of(data), model.library, model.order)
     return Bound(found.at(1, 1), design(found.at, target=target), tuple(found.note.splitlines()), tuple(found.warnings))
 
 
-def results(name: str | Path) -> Mapping[str, pd.DataFrame]:
+class Tables(dict[str, pd.DataFrame]):
+    """Published tables by name; see `results` for an example."""
+
+    def __repr__(self) -> str:
+        return f"Tables({', '.join(f'{name}: {len(frame)} rows' for name, frame in self.items())})"
+
+    def _repr_html_(self) -> str:
+        return "".join(f"<p>{html.escape(name)}</p>{html_table(frame.head())}" for name, frame in self.items())
+
+
+def results(name: str | Path) -> Tables:
     """Return the tables of a published run, or of a folder with published tables, by name.
 
     Args:
@@ -237,8 +245,8 @@ def results(name: str | Path) -> Mapping[str, pd.DataFrame]:
     Examples:
         >>> import latticebench as lb
         >>> tables = lb.results("default")
-        >>> "cases" in tables
-        True
+        >>> tables
+        Tables(cases: ... rows, coefficients: ... rows, errors: ... rows...)
         >>> tables["cases"]["e2"].dtype
         dtype('float64')
     """
@@ -251,7 +259,7 @@ def results(name: str | Path) -> Mapping[str, pd.DataFrame]:
             f"{name}: there are no published tables; give a folder with .csv files of `latticebench table`"
         )
     found = {path.stem: read_table(path) for path in paths}
-    return {key: frame.apply(_numbers) for key, frame in found.items()}
+    return Tables({key: frame.apply(_numbers) for key, frame in found.items()})
 
 
 @dataclass(frozen=True, eq=False)

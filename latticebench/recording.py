@@ -28,6 +28,7 @@ from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
     import xarray
+    from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
     from latticebench.bench.overlay import Overlay
@@ -104,9 +105,10 @@ class Recording:
             raise InputError(f"trajectory {trajectory}: {self.samples[0].source} has {len(self.samples)}")
         return of_recording(self.samples[trajectory - 1])
 
-    def inspect(self, model: Model | None = None) -> tuple[Inspection, ...]:
-        """Return what each trajectory is like, and what is suspicious; see `latticebench inspect`."""
-        return tuple(inspect_samples(one, None if model is None else model.library) for one in self.samples)
+    def inspect(self, model: Model | None = None) -> Inspected:
+        """Return what the recording is like, and what is suspicious; with a model, whether it makes sense in that."""
+        library = None if model is None else model.library
+        return Inspected(self, tuple(inspect_samples(one, library) for one in self.samples))
 
     def __repr__(self) -> str:
         first, units = self.samples[0], in_words(units_of(self.samples[0].origin))
@@ -180,6 +182,66 @@ def read(
     return Recording(tuple(read_all([Path(str(one)) for one in paths], "unknown", layout)))
 
 
+@dataclass(frozen=True, eq=False)
+class Inspected:
+    """What a recording is like before any equation.
+
+    Attributes:
+        data: the recording.
+        trajectories: what each trajectory is like (`latticebench.bench.inspection.Inspection`).
+
+    >>> import latticebench as lb
+    >>> import numpy as np
+    >>> t = np.arange(0, 20, 0.1)
+    >>> u = np.stack([np.cos(3 * t), np.full(200, 0.5)], axis=1)
+    >>> seen = lb.read((t, u)).inspect()
+    >>> seen.suspicious
+    ('u2: always 0.5; does this sensor work?',)
+    >>> seen.table["readings"].tolist()
+    [200, 200]
+    """
+
+    data: Recording
+    trajectories: tuple[Inspection, ...]
+
+    @property
+    def suspicious(self) -> tuple[str, ...]:
+        """What deserves a look, one sentence each."""
+        return tuple(dict.fromkeys(line for one in self.trajectories for line in one.suspicious))
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """Each sensor of each trajectory: its column, readings, range, noise and converter step, in the file's unit."""
+        rows = [
+            {"trajectory": number, "site": site, **vars(sensor)}
+            for number, one in enumerate(self.trajectories, 1)
+            for site, sensor in enumerate(one.sensors, 1)
+        ]
+        frame = pd.DataFrame(rows).rename(columns={"name": "column"})
+        return frame if len(self.trajectories) > 1 else frame.drop(columns="trajectory")
+
+    @property
+    def figure(self) -> Figure:
+        """The readings of every sensor of the first trajectory, one above the other, and their spectrum."""
+        from latticebench.bench.report.inspected import picture
+
+        return picture(self.data.samples[0])
+
+    def _lines(self) -> list[str]:
+        from latticebench.bench.report.inspected import lines
+
+        told = [f"Suspicious: {line}" for line in self.suspicious] or ["Nothing suspicious."]
+        for one, samples in zip(self.trajectories, self.data.samples, strict=True):
+            told += [one.source, *one.notes, *lines(one, samples.origin.time)]
+        return told
+
+    def __repr__(self) -> str:
+        return "\n".join([*self._lines(), self.table.to_string(index=False)])
+
+    def _repr_html_(self) -> str:
+        return f"<p>{'<br>'.join(map(html.escape, self._lines()))}</p>{html_table(self.table)}"
+
+
 @dataclass(frozen=True)
 class Model:
     """An equation of motion with free coefficients.
@@ -211,6 +273,11 @@ class Model:
 
     def __repr__(self) -> str:
         return f'Model("{self.terms}", order={self.order}, ends="{self.ends}")'
+
+    def _repr_html_(self) -> str:
+        left = "u" + "'" * self.order
+        right = " + ".join(f"c{k} ({text})" for k, text in enumerate(self.library.texts, 1))
+        return f"<p><code>{html.escape(f'{left} = {right}')}</code>; ends {self.ends}</p>"
 
 
 def system(name: str, library: str = "equation") -> Model:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from latticebench.methods.method import Method
 
-# What `latticebench fit` uses when no method is named.
-DEFAULT = "stlsq"
+# What a fit uses when no method is named.
+DEFAULT = "trajectory"
 # Methods of earlier versions, and what they are called now.
 RENAMED = {"pinn-vp": "pielm"}
 

@@ -27,7 +27,9 @@ def swing(scale=1.0, noise=1e-3):
 
 
 def test_the_public_names_are_these_and_all_can_be_had():
-    classes = ["Bound", "Cause", "Film", "Fitted", "Model", "Picture", "Recording", "Residual", "Run"]
+    classes = [
+        "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Tables",
+    ]  # fmt: skip
     functions = ["diagnose", "fit", "limit", "read", "results", "run", "system"]
     assert sorted(lb.__all__) == sorted([*classes, *functions, *lb.ROOMS, "__version__"])
     assert [getattr(lb, name).__doc__ for name in lb.__all__ if name != "__version__"].count(None) == 0
@@ -78,8 +80,8 @@ def test_a_fit_gives_tables_intervals_and_a_simulation():
 def test_every_object_shows_itself_and_has_an_example(name):
     one = getattr(lb, name)
     assert one.__repr__ is not object.__repr__
-    assert hasattr(one, "_repr_html_") or name == "Model"
-    assert ">>> import latticebench as lb" in inspect.getdoc(one) + "".join(
+    assert hasattr(one, "_repr_html_")
+    assert name == "Tables" or ">>> import latticebench as lb" in inspect.getdoc(one) + "".join(
         inspect.getdoc(part) or "" for part in vars(one).values() if inspect.isfunction(part)
     )
 
@@ -229,8 +231,12 @@ def test_a_recording_shows_itself_and_what_is_suspicious():
     data = lb.read(frame, columns="x*")
     assert "not read: note" in repr(data)
     assert "<table" in data._repr_html_()
-    (about,) = data.inspect(PENDULUM)
+    about = data.inspect(PENDULUM)
     assert any("x2: always 5" in line for line in about.suspicious)
+    assert "Suspicious: x2: always 5" in repr(about)
+    assert about._repr_html_().count("<table") == 1
+    assert about.table["column"].tolist() == ["x1", "x2"]
+    assert len(about.figure.axes) == 2
 
 
 def test_importing_the_package_loads_no_front():

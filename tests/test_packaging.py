@@ -41,6 +41,22 @@ def test_the_conda_recipe_asks_for_what_the_project_asks_for() -> None:
     assert f"- {' = '.join(script)}\n" in RECIPE
 
 
+def test_every_package_that_is_needed_and_every_link_of_a_page_is_listed_with_the_licences() -> None:
+    listed = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
+    extras = [
+        text
+        for name, texts in PROJECT["optional-dependencies"].items()
+        if name not in ("test", "dev")
+        for text in texts
+    ]
+    for text in [*PROJECT["dependencies"], *extras]:
+        name = re.split(r"[<>=;]", text)[0].lower()
+        assert re.search(rf"\b{name}\b", listed.lower()), name
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+        for link in re.findall(r"https?://[^\s)>`\"']+", page.read_text(encoding="utf-8")):
+            assert link in listed, f"{page.name}: {link}"
+
+
 def test_continuous_integration_runs_every_python_on_every_system() -> None:
     text = (ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8")
     (listed,) = re.findall(r"python: \[(.*)\]", text)

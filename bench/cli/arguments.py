@@ -1,4 +1,4 @@
-"""What the texts on the command line stand for: equations, numbers, cases; and how a failed fit is told."""
+"""What the texts on the command line stand for: equations, numbers, cases; and how outputs that fail are told."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from latticebench.systems.errors import InputError
 if TYPE_CHECKING:
     from latticebench.bench.fitting import FitCase
     from latticebench.systems.lattice import Library, System
-    from latticebench.systems.samples import Samples
 
 
 def asked(
@@ -91,29 +90,6 @@ def numbers(given: Sequence[str] | None) -> dict[str, float]:
         if not math.isfinite(numbers[name]):
             raise InputError(f"--set {name}={value}: {value!r} is not a number")
     return numbers
-
-
-@contextmanager
-def told(data: Sequence[Samples], method: str | None, what: str) -> Iterator[None]:
-    """Turn whatever ends a fit into one line of text.
-
-    Raises:
-        InputError: it was skipped, or it failed.
-    """
-    from latticebench.methods.method import Skipped
-
-    try:
-        yield
-    except Skipped as reason:
-        if method is None:
-            raise InputError(f"{data[0].source}: {reason}") from None
-        raise InputError(
-            f"method {method!r} cannot fit {data[0].source}: {reason}; choose another with --method"
-        ) from None
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{data[0].source}: {what} failed: {type(error).__name__}: {error}") from error
 
 
 @contextmanager

@@ -22,14 +22,12 @@ def demo(
     ] = Path("demo"),
 ) -> None:
     """Simulate seven pendula with a defect and a sensor that is off, and find both; takes about half a minute."""
+    from latticebench.bench import calls
     from latticebench.bench import demo as made
-    from latticebench.bench.report.content import content
     from latticebench.bench.report.curves import curves
     from latticebench.bench.report.document import provenance
     from latticebench.bench.report.page import write_page
     from latticebench.bench.report.screen import console, watching
-    from latticebench.diagnosis import repair
-    from latticebench.systems.effects import CATALOGUE
     from latticebench.systems.files import shown
     from latticebench.systems.lattice import library
     from latticebench.systems.layout import Layout
@@ -47,8 +45,7 @@ def demo(
     data = read(recording, "free", Layout(made.TIME, (made.COLUMNS,), made.SCALE))
     say_notes(data)
     with watching() as watcher, redirect_stdout(sys.stderr):
-        found = repair.diagnose(library("declared", made.TERMS), 2, data, CATALOGUE, watcher=watcher)
-    report = content(found)
+        found, report = calls.diagnose(data, library("declared", made.TERMS), 2, watcher=watcher)
     write_page(report, curves(found), provenance(), page)
     screen = console()
     screen.print(report.sentence, style="bold", highlight=False, markup=False, soft_wrap=True)

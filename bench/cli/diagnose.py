@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stdout
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import asked, kept, told
+from latticebench.bench.cli.arguments import asked, kept
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, check_places, complete_systems, place
 from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, layout_of, read_told
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
+    from latticebench.bench.report.content import Report
     from latticebench.diagnosis.repair import Diagnosis
     from latticebench.systems.lattice import Library, System
     from latticebench.systems.samples import Samples
@@ -68,37 +68,23 @@ def diagnose(
     ] = None,
 ) -> None:
     """Find what a declared equation lacks: trace its residual to an effect, add it, show the error before and after."""
+    from latticebench.bench import calls
     from latticebench.bench.report.screen import watching
-    from latticebench.diagnosis import repair
-    from latticebench.systems.effects import CATALOGUE
     from latticebench.systems.readers import read_all
-    from latticebench.systems.user_files import load_effects
 
     check_places([*files, *(holdout or ()), effects, system], json=json_out, html=html_out)
     layout = layout_of(time, columns, scale, sort)
     known, declared, order = _declared(system, terms, order)
-    catalogue = (*CATALOGUE, *(load_effects(effects) if effects is not None else ()))
     ends = ends or ("unknown" if known is None else known.ends)
     data = read_told(files, ends, layout)
     _check_field(known, data)
     # Read together, since the two must be of the same chain.
     later = read_all([*files, *holdout], ends, layout)[len(data) :] if holdout else []
-    with told(data, None, "the diagnosis"), watching() as watcher, redirect_stdout(sys.stderr):
-        run = partial(repair.diagnose, declared, order, data, catalogue, held_out=later, watcher=watcher)
-        found, interrupted = _as_far_as_it_came(run)
-    _report(found, json_out, html_out, interrupted=interrupted)
-    if interrupted:
+    with watching() as watcher, redirect_stdout(sys.stderr):
+        found, report = calls.diagnose(data, declared, order, effects=effects, later=later, watcher=watcher)
+    _report(found, report, json_out, html_out)
+    if report.interrupted:
         raise typer.Exit(INTERRUPTED)
-
-
-def _as_far_as_it_came(run: Callable[[], Diagnosis]) -> tuple[Diagnosis, bool]:
-    """Return a diagnosis, or what of it was known when Ctrl-C ended it, and whether that was so."""
-    from latticebench.diagnosis.repair import Interrupted
-
-    try:
-        return run(), False
-    except Interrupted as stop:
-        return stop.diagnosis, True
 
 
 def _declared(system: str | None, terms: str | None, order: int | None) -> tuple[System | None, Library, int]:
@@ -132,19 +118,19 @@ def _check_field(known: System | None, data: Sequence[Samples]) -> None:
         )
 
 
-def _report(found: Diagnosis, json_out: str | None, html_out: Path | None, *, interrupted: bool) -> None:
+def _report(found: Diagnosis, report: Report, json_out: str | None, html_out: Path | None) -> None:
     """Show a diagnosis on the screen, and write it as JSON and as a page.
 
     Raises:
         InputError: a file cannot be written; the others are, and the screen has it all.
     """
     from latticebench.bench.overlay import of_diagnosis
-    from latticebench.bench.report.content import content, diagnosis_document
+    from latticebench.bench.report.content import diagnosis_document
     from latticebench.bench.report.document import provenance, to_json
     from latticebench.bench.report.text import show
     from latticebench.systems.files import write_text
 
-    report, about = content(found, interrupted=interrupted), provenance()
+    about = provenance()
     text = "" if json_out is None else to_json(diagnosis_document(report, about, of_diagnosis(found)))
     failures: list[str] = []
     # Files first: whoever reads the screen may stop reading.

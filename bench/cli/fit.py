@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import asked, kept, pairs, told
+from latticebench.bench.cli.arguments import asked, kept, pairs
 from latticebench.bench.cli.options import (
     AnyEnds,
     JsonOut,
@@ -69,10 +69,9 @@ def fit(
     A method of your own (.py) runs in a process of its own, within the limits; so does any method where one is given.
     """
     from latticebench import methods
-    from latticebench.bench.adequacy import adequacy
-    from latticebench.bench.apart import Apart, fit_apart, fit_here
+    from latticebench.bench import calls
+    from latticebench.bench.apart import Apart, fit_apart
     from latticebench.bench.case import code_file
-    from latticebench.bench.inspection import sine_warning
     from latticebench.bench.report.screen import waiting
     from latticebench.methods.method import make
     from latticebench.systems.files import check_regular
@@ -81,25 +80,25 @@ def fit(
     check_places([*files, system, method], json=json_out, html=html_out)
     layout = layout_of(time, columns, scale, sort)
     own = code_file(method)
-    if own is None:
-        make(methods.find(method), pairs(given), texts=True)
-    else:
+    chosen = None if own is not None else make(methods.find(method), pairs(given), texts=True)
+    if own is not None:
         check_regular(Path(own))
     # What a file of the user's prints is for people, not for a program that reads the result.
     with redirect_stdout(sys.stderr):
         _, candidates, order = asked(system, library, terms, order)
     data = read_told(files, ends, layout)
-    asked_for = Apart(
-        files=tuple(files), ends=ends, terms=candidates.texts, order=order, method=method, settings=pairs(given),
-        seed=seed, time_limit=time_limit or TIME_LIMIT, memory_limit=memory_limit or MEMORY_LIMIT, layout=layout,
-    )  # fmt: skip
-    with told(data, method, f"method {method!r}"), waiting(f"{method}: fitting {len(candidates.terms)} terms"):
-        if own is None and time_limit is None and memory_limit is None:
-            found = fit_here(asked_for, data, candidates)
+    with waiting(f"{method}: fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
+        if chosen is not None and time_limit is None and memory_limit is None:
+            found = calls.fit(data, candidates, order, chosen, seed)
         else:
-            found = fit_apart(asked_for, candidates)
-        with redirect_stdout(sys.stderr):
-            quality = adequacy(data, found).also(sine_warning(data, candidates))
+            apart = Apart(
+                files=tuple(files), ends=ends, terms=candidates.texts, order=order, method=method,
+                settings=pairs(given), seed=seed, time_limit=time_limit or TIME_LIMIT,
+                memory_limit=memory_limit or MEMORY_LIMIT, layout=layout,
+            )  # fmt: skip
+            with calls.told(data, method):
+                found = fit_apart(apart, candidates)
+        quality = calls.judged(data, found)
     _report(found, data, quality, seed, json_out, html_out)
 
 

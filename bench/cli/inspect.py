@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -42,7 +41,10 @@ def inspect(
     With --terms or --system it is also told whether the readings make sense in an equation with them.
     """
     from latticebench.bench.cli.arguments import kept
+    from latticebench.bench.figures import save
     from latticebench.bench.inspection import inspect as look
+    from latticebench.bench.provenance import command_line
+    from latticebench.bench.report.inspected import picture
     from latticebench.systems.errors import InputError, unknown
     from latticebench.systems.files import write_text
     from latticebench.systems.readers import read_all
@@ -65,7 +67,7 @@ def inspect(
                 write_text(Path(json_out), text)
     if out is not None:
         with kept(failures):
-            _draw(data[0], out)
+            save(picture(data[0]), out, {"command": command_line()})
     if json_out == "-":
         print(text, end="")
     else:
@@ -86,9 +88,9 @@ def _terms(system: str | None, terms: str | None) -> Library | None:
 
 def _show(found: Inspection, samples: Samples) -> None:
     """Print what a recording is like, the suspicious first."""
+    from latticebench.bench.report.inspected import lines, sensors
     from latticebench.bench.report.screen import console, show_rows
 
-    time, unit = samples.origin.time, samples.origin.unit
     screen = console()
 
     def say(text: str, style: str = "") -> None:
@@ -101,61 +103,6 @@ def _show(found: Inspection, samples: Samples) -> None:
         say("Nothing suspicious.")
     for line in found.suspicious:
         say(f"Suspicious: {line}", "bold red")
-    span = f"t = {found.begin:g} to {found.end:g} {time}".rstrip()
-    every = f"every {found.interval:.4g} {time}".rstrip() + (", unevenly" if found.uneven else "")
-    say(f"{found.sites} sites, {found.rows} rows{_also(found.seen)}; {span}, {every}")
-    for begin, end in found.gaps:
-        say(f"gap from t = {begin:g} to {end:g}")
-    frequencies = ", ".join(f"{one:.4g}" for one in found.frequencies)
-    say(f"main frequencies{f' in 1/{time}' if time else ''}: {frequencies or 'none stands out'}")
-    rows = [
-        [
-            str(site), one.name, str(one.readings), str(one.missing), f"{one.least:.4g}", f"{one.most:.4g}",
-            "not seen" if one.noise != one.noise else f"{one.noise:.2g}", f"{one.step:.3g}" if one.step else "-",
-        ]
-        for site, one in enumerate(found.sensors, 1)
-    ]  # fmt: skip
-    inside = f" ({unit})" if unit else ""
-    show_rows(["site", "column", "readings", "missing", f"least{inside}", f"most{inside}", "noise", "steps"], rows)
-
-
-def _also(seen: Sequence[str]) -> str:
-    names = {"v": "velocities", "f": "an input"}
-    return f", with {' and '.join(names[one] for one in seen)}" if seen else ""
-
-
-def _draw(samples: Samples, out: Path) -> None:
-    """Draw the readings of every sensor, one above the other, and their spectrum."""
-    import numpy as np
-    from matplotlib.figure import Figure
-
-    from latticebench.bench.colours import INK
-    from latticebench.bench.escape import label
-    from latticebench.bench.figures import save
-    from latticebench.bench.plots import in_decades
-    from latticebench.bench.provenance import command_line
-    from latticebench.bench.report.units import axis, with_unit
-    from latticebench.diagnosis.problem import Spectrum
-    from latticebench.methods.engine.dynamics import split_parts
-
-    origin = samples.origin
-    values = split_parts(samples.u, samples.is_complex)[:, 0] / origin.scale
-    figure = Figure(figsize=(9, 5), layout="constrained")
-    readings, lines = figure.subplots(1, 2, width_ratios=(2, 1))
-    middle = np.nanmean(values, axis=0)
-    spacing = 1.1 * float(np.nanmax(np.abs(values - middle))) or 1.0
-    readings.plot(samples.t, values - middle + spacing * np.arange(samples.sites), color=INK, linewidth=0.8)
-    names = [label(one) for one in origin.columns] or [f"u{site + 1}" for site in range(samples.sites)]
-    every = max(1, samples.sites // 20)
-    readings.set_yticks(spacing * np.arange(samples.sites)[::every], names[::every])
-    readings.set_xlabel(axis("t", origin.time))
-    apart = label(with_unit(f"{spacing:.2g}", origin.unit))
-    readings.set_title(f"readings about their means; {apart} from one to the next")
-    spectrum = Spectrum.of(samples)
-    lines.plot(spectrum.omega / (2 * np.pi), spectrum.power, color=INK, linewidth=0.8)
-    if in_decades(lines):
-        top = float(np.max(spectrum.power))
-        lines.set_ylim(1e-8 * top, 2 * top)
-    lines.set_xlabel(f"cycles per {label(origin.time) or 'unit of time'}")
-    lines.set_title("mean power spectrum")
-    save(figure, out, {"command": command_line()})
+    for line in lines(found, samples.origin.time):
+        say(line)
+    show_rows(*sensors(found, samples.origin.unit))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import asked, case_of, numbers, told
+from latticebench.bench.cli.arguments import asked, case_of, numbers
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, Yes, check_places, complete_systems
 from latticebench.bench.cli.options import Library as LibraryName
 from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, layout_of, read_told
@@ -42,7 +42,7 @@ Ends = Annotated[
 
 def limit(
     files: Annotated[
-        list[Path] | None, typer.Argument(help="BoundOf samples; without any, samples of --system are taken.")
+        list[Path] | None, typer.Argument(help="Recorded samples; without any, samples of --system are taken.")
     ] = None,
     system: System = None,
     library: LibraryName = None,
@@ -99,12 +99,11 @@ def limit(
 
 def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> BoundOf:
     """Return the bound of recordings, while a terminal is told what is waited for."""
-    from latticebench.bench.bounds import of_recordings
+    from latticebench.bench import calls
     from latticebench.bench.report.screen import waiting
 
-    fitting = f"fitting {len(candidates.terms)} terms"
-    with told(data, None, "the fit"), waiting(fitting), redirect_stdout(sys.stderr):
-        return of_recordings(data, candidates, order)
+    with waiting(f"fitting {len(candidates.terms)} terms"), redirect_stdout(sys.stderr):
+        return calls.bound(data, candidates, order)
 
 
 def _of_simulated(case: FitCase, sites: int | None) -> BoundOf:

@@ -99,7 +99,8 @@ SystemOption = Annotated[
 MethodOption = Annotated[
     str | None,
     typer.Option(
-        help="A name from `list methods`, or a .py file with one of your own.", autocompletion=complete_methods,
+        help="A name from `list methods`, or a .py file with one of your own; trajectory if not given.",
+        autocompletion=complete_methods,
         parser=named, metavar="NAME",
     ),
 ]  # fmt: skip

@@ -20,8 +20,8 @@ from latticebench.bench.report.separation import Separation, separations
 from latticebench.bench.report.shown import Shown
 from latticebench.bench.report.units import Units, in_sentence, noise_in_words, units_of
 from latticebench.bench.report.whereabouts import Whereabouts, whereabouts
-from latticebench.diagnosis import rules
-from latticebench.diagnosis.instrument import step_of
+from latticebench.diagnosis.instrument import step_of, two_digits
+from latticebench.diagnosis.repair import NOT_REACHED, shortfalls
 from latticebench.methods.engine.dynamics import split_parts
 
 if TYPE_CHECKING:
@@ -115,6 +115,7 @@ class Report(Content):
 
     Attributes:
         sentence: the verdict in one sentence.
+        partly: why what is named explains only a part, see `latticebench.diagnosis.repair.shortfalls`.
         declared, declared_stderr: coefficients of the declared terms in the last model, with standard errors.
         declared_before, declared_stderr_before: the same in the declared equation alone.
         declared_truth: their true values, or None.
@@ -149,6 +150,7 @@ class Report(Content):
     left: tuple[Left, ...]
     notes: tuple[str, ...]
     interrupted: bool
+    partly: tuple[str, ...] = ()
 
 
 class DiagnosisDocument(Report, Document):
@@ -190,7 +192,7 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
                  instead=one.instead)
             for one in diagnosis.left
         ),
-        notes=notes(diagnosis), interrupted=interrupted,
+        notes=notes(diagnosis), interrupted=interrupted, partly=shortfalls(diagnosis),
     )  # fmt: skip
 
 
@@ -217,7 +219,7 @@ def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
         said.append(
             f"Something without a name, {best.name}{where}, does better in the place of {_listed(best.instead)}."
         )
-    lost = diagnosis.residual[1] > rules.LOST
+    lost = NOT_REACHED in shortfalls(diagnosis)
     if len(rivals) < len(diagnosis.left):
         size = "" if lost else f"; in all, the model leaves {diagnosis.residual[1]:.3g} times the noise"
         said.append(f"Something more is left that nothing in the catalogue explains{size}.")
@@ -225,7 +227,9 @@ def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
         them = "it" if len(names) == 1 else "them"
         said.append(f"With {them}, nothing significant is left.")
     if lost:
-        said.append(f"The model does not reach the readings: it leaves {diagnosis.residual[1]:.2g} times their noise.")
+        said.append(
+            f"The model does not reach the readings: it leaves {two_digits(diagnosis.residual[1])} times their noise."
+        )
     return " ".join(said)
 
 

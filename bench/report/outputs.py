@@ -154,6 +154,7 @@ class Diagnosed(Content):
 
     status: str
     verdict: Text
+    partly: Text
     named: Text
     residual_before: Number
     residual_after: Number
@@ -182,6 +183,31 @@ class TrialRow(Diagnosed):
     cpu_seconds: Number
 
 
+class LaboratoryRow(Diagnosed):
+    """A row of the table of laboratory recordings; residuals are in units of the noise that was added."""
+
+    part: Words
+    asked: str
+    seed: int
+    instrument: str
+    sites: Number
+    ends: Text
+    readings: Number
+    periods: Number
+    declared: Text
+    count: Number
+    truth: str
+    right: Flag
+    right_alike: Flag
+    missed: Text
+    invented: Text
+    placed: Text
+    covered: Number
+    intervals: Number
+    pieces: Number
+    cpu_seconds: Number
+
+
 class RecordingRow(Diagnosed):
     """A row of the table of measured recordings."""
 
@@ -196,7 +222,7 @@ class RunDocument(Document):
     schema_: Literal["latticebench/run/1"] = Field(
         default="latticebench/run/1", validation_alias="schema", serialization_alias="schema"
     )
-    cases: list[FitRow | TrialRow | RecordingRow]
+    cases: list[FitRow | TrialRow | LaboratoryRow | RecordingRow]
 
 
 class ComparedCase(Content):

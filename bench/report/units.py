@@ -104,5 +104,6 @@ def noise_in_words(noise: Noise, steps: Sequence[float], interval: float, sites:
         part = replace(noise, size=noise.size[own] / abs(units.scale), memory=noise.memory[own])
         unit = units.reading if begin == 0 else rate_of(units.reading, units.time)
         grid = [step / abs(units.scale) for step in steps[own]]
-        lines += [("velocity, " if begin else "") + line for line in describe(part, grid, unit, interval=interval)]
+        told = describe(part, grid, unit, interval=interval, time=units.time)
+        lines += [("velocity, " if begin else "") + line for line in told]
     return lines

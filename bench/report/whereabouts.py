@@ -12,6 +12,7 @@ import numpy as np
 import pydantic
 
 from latticebench.bench.report.document import Content
+from latticebench.diagnosis.instrument import two_digits
 from latticebench.diagnosis.noise import Noise, Rows
 
 if TYPE_CHECKING:
@@ -175,12 +176,14 @@ def _words(
     found = []
     # That the only site has it is no news.
     if sites and sites_in_all > 1:
-        listed = [f"site {one.site} ({one.residual:.2g} times the noise)" for one in sites[:3]]
+        listed = [f"site {one.site} ({two_digits(one.residual)} times the noise)" for one in sites[:3]]
         more = f"; {len(sites)} of {sites_in_all} sites have some." if len(sites) > 3 else "."
         alike = _alike("sites", [one.residual for one in sites], sites_in_all)
         found.append(alike or f"Most at {', '.join(listed)}{more}")
     if times:
-        listed = [f"t = {one.begin:.4g} to {one.end:.4g} ({one.residual:.2g} times the noise)" for one in times[:2]]
+        listed = [
+            f"t = {one.begin:.4g} to {one.end:.4g} ({two_digits(one.residual)} times the noise)" for one in times[:2]
+        ]
         alike = _alike("times", [one.residual for one in times], windows_in_all)
         found.append(alike or f"Most at {', '.join(listed)}.")
     if lines:
@@ -192,5 +195,5 @@ def _words(
 def _alike(noun: str, sizes: list[float], in_all: int) -> str:
     """Return a sentence where all sites or times have nearly the same residual, else nothing."""
     if len(sizes) == in_all > 1 and sizes[0] < 1.5 * sizes[-1]:
-        return f"At all {noun} alike, {sizes[-1]:.2g} to {sizes[0]:.2g} times the noise."
+        return f"At all {noun} alike, {two_digits(sizes[-1])} to {two_digits(sizes[0])} times the noise."
     return ""

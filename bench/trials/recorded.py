@@ -28,8 +28,8 @@ ERRORS = {
 def table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """Make the table of recordings: one row each with the verdict, what was named, and errors before and after."""
     columns = [
-        "name", "file", "terms", "status", "verdict", "named", "residual_before", "residual_after", "forecast_before",
-        "forecast_after", "seconds", "message",
+        "name", "file", "terms", "status", "verdict", "partly", "named", "residual_before", "residual_after",
+        "forecast_before", "forecast_after", "seconds", "message",
     ]  # fmt: skip
     rows = []
     for result in results:
@@ -42,9 +42,11 @@ def summarised(report: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the verdict, the named effects, and the errors before and after of a report; None for each without one."""
     errors = [f"{name}_{when}" for name in ("residual", "forecast") for when in ("before", "after")]
     if report is None:
-        return dict.fromkeys(["verdict", "named", *errors])
+        return dict.fromkeys(["verdict", "partly", "named", *errors])
     found = {name: report["error"][name.split("_")[0]][name.split("_")[1]] for name in errors}
-    return {"verdict": report["verdict"], "named": " + ".join(one["effect"] for one in report["effects"]), **found}
+    named = " + ".join(one["effect"] for one in report["effects"])
+    # A report of an earlier version did not say.
+    return {"verdict": report["verdict"], "partly": "; ".join(report.get("partly", ())), "named": named, **found}
 
 
 def publish(

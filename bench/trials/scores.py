@@ -24,7 +24,7 @@ FIGURES = ("confusion",)
 # By which a trial is known in a published table.
 SETTINGS = ("system", "effect", "z", "noise", "velocities", "seed")
 COLUMNS = (
-    *SETTINGS, "status", "size", "apart", "verdict", "named", "alike", "right", "extra",
+    *SETTINGS, "status", "size", "apart", "verdict", "partly", "named", "alike", "right", "extra",
     "residual_before", "residual_after", "forecast_before", "forecast_after",
     "coefficients_before", "coefficients_after", "seconds", "cpu_seconds", "message",
 )  # fmt: skip
@@ -58,6 +58,8 @@ def table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
             # Judged here, so that a run is judged by the rule as it stands.
             row["right"] = is_right(row["effect"], row["named"], row["alike"], row["verdict"])
         row["named"] = " + ".join(row["named"] or ())
+        # A trial of an earlier version did not say.
+        row["partly"] = "; ".join(row.get("partly") or ())
         row["alike"] = "; ".join(", ".join(group) for group in row["alike"] or ())
         rows.append({name: row[name] for name in COLUMNS})
     frame = pd.DataFrame(rows, columns=list(COLUMNS))

@@ -18,7 +18,7 @@ from latticebench.bench.axes import Listed, Seeds
 from latticebench.bench.case import Case, Folders, Roots, Seed, Settings, code_file, plain
 from latticebench.bench.trials import faults, specimen
 from latticebench.bench.trials.specimen import Conditions, Specimen
-from latticebench.diagnosis.repair import Diagnosis, diagnose
+from latticebench.diagnosis.repair import Diagnosis, diagnose, shortfalls
 from latticebench.methods.method import Skipped
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError, unknown
@@ -75,10 +75,10 @@ class Trial(Case):
     def blank(self) -> dict[str, Any]:
         """Return the names of a result's content; see `run`."""
         return {
-            "size": None, "apart": None, "about": None, "verdict": None, "named": None, "alike": None, "right": None,
-            "extra": None, "noise_found": None, "noise_true": None, "residual_before": None, "residual_after": None,
-            "forecast_before": None, "forecast_after": None, "coefficients_before": None, "coefficients_after": None,
-            "seconds": None, "cpu_seconds": None,
+            "size": None, "apart": None, "about": None, "verdict": None, "partly": None, "named": None, "alike": None,
+            "right": None, "extra": None, "noise_found": None, "noise_true": None, "residual_before": None,
+            "residual_after": None, "forecast_before": None, "forecast_after": None, "coefficients_before": None,
+            "coefficients_after": None, "seconds": None, "cpu_seconds": None,
         }  # fmt: skip
 
     def run(self, folders: Folders, found: dict[str, Any]) -> None:
@@ -95,7 +95,7 @@ class Trial(Case):
         alike = [list(one.alternatives) for one in diagnosis.findings]
         wanted = wanted_names(self.effect)
         found.update(
-            verdict=diagnosis.verdict, named=named, alike=alike,
+            verdict=diagnosis.verdict, partly=list(shortfalls(diagnosis)), named=named, alike=alike,
             right=is_right(self.effect, named, alike, diagnosis.verdict),
             extra=max(len(named) - max(len(wanted), 1), 0) if wanted else len(named),
         )  # fmt: skip

@@ -163,6 +163,7 @@ def test_pictures_are_what_their_ending_says_and_films_move(run: Run, swings: Sa
         assert "latticebench plot swings.csv" in picture.info["Description"]
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 9  # type: ignore[attr-defined]
+        assert b"commit" in film.info["comment"]
 
 
 def test_a_fit_is_drawn_from_its_document_alone(run: Run, swings: Samples, tmp_path: Path) -> None:

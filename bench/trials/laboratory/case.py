@@ -16,7 +16,7 @@ from latticebench.bench.trials.laboratory.effects import ANY, LOCAL, MOST_EFFECT
 from latticebench.bench.trials.laboratory.instruments import HELD_OUT, KINDS, Kind
 from latticebench.bench.trials.laboratory.judging import Finding, findings, residual, written
 from latticebench.bench.trials.laboratory.making import LabRecording, make_recording
-from latticebench.diagnosis.repair import diagnose
+from latticebench.diagnosis.repair import diagnose, shortfalls
 from latticebench.methods.method import Skipped
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError, unknown
@@ -54,7 +54,7 @@ class Laboratory(Case):
     def blank(self) -> dict[str, Any]:
         """Return the names of a result's content; see `run`."""
         return {
-            "recording": None, "truth": None, "verdict": None, "findings": None,
+            "recording": None, "truth": None, "verdict": None, "partly": None, "findings": None,
             "noise_found": None, "noise_true": None, "residual_before": None, "residual_after": None,
             "pieces": None, "forecast_before": None, "forecast_after": None, "seconds": None, "cpu_seconds": None,
         }  # fmt: skip
@@ -83,7 +83,8 @@ class Laboratory(Case):
         diagnosis = diagnose(one.declared, one.order, [one.samples], CATALOGUE)
         found.update(seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
         found.update(
-            verdict=diagnosis.verdict, findings=[_plain(each) for each in findings(diagnosis)],
+            verdict=diagnosis.verdict, partly=list(shortfalls(diagnosis)),
+            findings=[_plain(each) for each in findings(diagnosis)],
             noise_found=[plain(float(size)) for size in diagnosis.noise],
             residual_before=plain(residual(diagnosis.before, one.noise)),
             residual_after=plain(residual(diagnosis.after, one.noise)), pieces=diagnosis.after.pieces,

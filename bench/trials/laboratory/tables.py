@@ -23,9 +23,9 @@ TABLES = ("laboratory", "summary", "effects")
 FIGURES = ("confusion",)
 COLUMNS = (
     "part", "asked", "seed", "instrument", "sites", "ends", "readings", "periods", "declared", "status", "count",
-    "truth", "verdict", "named", "right", "right_alike", "missed", "invented", "placed", "covered", "intervals",
-    "residual_before", "residual_after", "pieces", "forecast_before", "forecast_after", "seconds", "cpu_seconds",
-    "message",
+    "truth", "verdict", "partly", "named", "right", "right_alike", "missed", "invented", "placed", "covered",
+    "intervals", "residual_before", "residual_after", "pieces", "forecast_before", "forecast_after", "seconds",
+    "cpu_seconds", "message",
 )  # fmt: skip
 # What the residual, in units of the noise that was added, may be when all has been found.
 FITS = 1.3
@@ -57,6 +57,8 @@ def _row(incomplete: Mapping[str, Any]) -> dict[str, Any]:
     case, made, truth = result["case"], result["recording"] or {}, result["truth"] or []
     row = {**case, **{name: result[name] for name in COLUMNS if name in result}, **made}
     row["asked"] = f"{case['instrument']} | {case['effects']}" + (f" | N={case['sites']}" if case["sites"] else "")
+    # A diagnosis of an earlier version did not say.
+    row["partly"] = "; ".join(result.get("partly") or ())
     row.update(message=result["reason"] or None, count=None if result["truth"] is None else len(truth))
     row["truth"] = " + ".join(f"{one['name']} z={one['z']:.3g}" for one in truth)
     if result["status"] != "ok":

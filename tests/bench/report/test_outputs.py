@@ -24,6 +24,7 @@ from latticebench.bench.report.document import Content, Number, Provenance, prov
 from latticebench.bench.report.outputs import (
     FitDocument,
     FitRow,
+    LaboratoryRow,
     RecordingRow,
     compare_document,
     fit_document,
@@ -33,6 +34,8 @@ from latticebench.bench.report.schema import DOCUMENTS, json_schema
 from latticebench.bench.report.units import units_of
 from latticebench.bench.tables import cases
 from latticebench.bench.trials import recorded, scores
+from latticebench.bench.trials.laboratory import tables as tables_of_laboratory
+from latticebench.bench.trials.laboratory.case import Laboratory
 from latticebench.bench.trials.measured import Measured
 from latticebench.bench.trials.trial import Trial
 from latticebench.bench.worker import outcome
@@ -125,20 +128,39 @@ def test_a_run_of_all_kinds_has_the_published_form(conforms: Conforms) -> None:
         "verdict": "explained", "effects": [{"effect": "damping"}],
         "error": {name: {"before": "inf", "after": 1.0} for name in ("residual", "forecast")},
     }  # fmt: skip
-    found = {"named": ["damping"], "alike": [[]], "verdict": "explained", "apart": 0.0, "residual_after": 1.0}
+    found = {
+        "named": ["damping"], "alike": [[]], "verdict": "partly explained", "partly": ["a", "b"], "apart": 0.0,
+        "residual_after": 1.0,
+    }  # fmt: skip
+    lost = {"recording": {"instrument": "coarse"}, "truth": []}
     tables = [
         cases([fit(1, 0.1), fit(2, "inf"), fit(3, None, "failed")]),
         scores.table([row(trial, "ok", **found), row(trial, "timeout")]),
         recorded.table([row(recording, "ok", report=report), row(recording, "skipped")]),
+        tables_of_laboratory.table([row(Laboratory(seed=20_001), "memory", **lost)]),
     ]
     every = [one for table in tables for one in table.to_dict("records")]
     written = conforms("run", to_json(run_document(every, describe([origin()], {"command": "x", "jobs": 2}, [1, 2]))))
     assert [one["e2"] for one in written["cases"][:3]] == [0.1, "inf", None]
     assert [one["right"] for one in written["cases"][3:5]] == [True, None]
-    assert [one["forecast_before"] for one in written["cases"][5:]] == ["inf", None]
-    assert [list(one) for one in (written["cases"][0], written["cases"][5])] == [
-        list(FitRow.model_fields), list(RecordingRow.model_fields),
-    ]  # fmt: skip
+    assert [one["partly"] for one in written["cases"][3:5]] == ["a; b", ""]
+    assert [one["forecast_before"] for one in written["cases"][5:]] == ["inf", None, None]
+    assert [list(written["cases"][place]) for place in (0, 5, 7)] == [
+        list(one.model_fields) for one in (FitRow, RecordingRow, LaboratoryRow)
+    ]
+
+
+def test_a_diagnosis_of_an_earlier_version_has_no_word_of_why_it_is_partial() -> None:
+    trial, recording = Trial(system="phi4", effect="damping", z=10), Laboratory(seed=20_001)
+    found = {"named": ["damping"], "alike": [[]], "verdict": "partly explained", "apart": 0.0}
+    made = {"instrument": "coarse"}
+    told = {"recording": made, "truth": [], "verdict": "partly explained", "findings": []}
+    for table, old in (
+        (scores.table, row(trial, "ok", **found)),
+        (tables_of_laboratory.table, row(recording, "ok", **told)),
+    ):
+        del old["partly"]
+        assert list(table([old])["partly"]) == [""]
 
 
 def test_a_comparison_has_the_published_form(conforms: Conforms) -> None:

@@ -21,6 +21,7 @@ from latticebench.bench.report.whereabouts import scaled_residuals, whereabouts
 from latticebench.diagnosis.acting import Chain, Placed
 from latticebench.diagnosis.acting.everywhere import Everywhere
 from latticebench.diagnosis.noise import Noise
+from latticebench.diagnosis.repair import NAMELESS, NOT_REACHED, SMALL
 from latticebench.systems.effects import CATALOGUE, Effect, find
 from latticebench.systems.samples import Samples
 
@@ -143,6 +144,7 @@ def test_what_is_left_without_a_name_is_told_with_its_site(pendula: Made, capsys
     assert rows.left(report)[1] == [["u[n]**4", "2", "31.0", "9.5"]]
     assert "Something more is left" in report.sentence
     assert report.sentence.endswith("; in all, the model leaves 1 times the noise.")
+    assert report.partly == (SMALL,)
     show(report)
     assert "u[n]**4" in capsys.readouterr().out
 
@@ -156,8 +158,19 @@ def test_what_does_better_than_an_effect_in_its_place_is_said_so(
     assert rows.instead(report)[1] == [["t*u[n]", "", "damping, sensor-gain", "9.4"]]
     assert "without a name, t*u[n], does better in the place of damping and sensor-gain" in report.sentence
     assert "more is left" not in report.sentence
+    assert report.partly == (NAMELESS,)
     show(report)
     assert "better by" in capsys.readouterr().out
+
+
+def test_what_is_left_is_not_called_small_where_the_readings_are_not_reached(pendula: Made) -> None:
+    left = SimpleNamespace(name="u[n]**4", gain=31.0, price=9.5, site=1, instead=())
+    rival = SimpleNamespace(name="t*u[n]", gain=9.4, price=3.0, site=None, instead=("damping",))
+    report = content(pendula(left=(left, rival), verdict="partly explained", residual=(40.0, 7.0)))
+    assert report.partly == (NAMELESS, NOT_REACHED)
+    assert report.sentence.endswith("The model does not reach the readings: it leaves 7 times their noise.")
+    assert content(pendula()).partly == ()
+    assert content(pendula(findings=(), left=(left,), verdict="unexplained")).partly == ()
 
 
 def test_the_terminal_shows_equation_search_errors_and_what_would_separate(
