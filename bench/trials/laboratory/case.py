@@ -12,7 +12,7 @@ import pydantic
 
 from latticebench.bench.axes import Listed, Seeds
 from latticebench.bench.case import Case, Folders, Roots, Seed, Settings, plain
-from latticebench.bench.trials.laboratory.effects import ANY, LOCAL, MOST_EFFECTS, NAMES, NONE
+from latticebench.bench.trials.laboratory.effects import ANY, ASKED, MOST_EFFECTS, NONE
 from latticebench.bench.trials.laboratory.instruments import HELD_OUT, KINDS, Kind
 from latticebench.bench.trials.laboratory.judging import Finding, findings, residual, written
 from latticebench.bench.trials.laboratory.making import LabRecording, make_recording
@@ -143,8 +143,8 @@ class Batch(Settings):
         for text in self.effects:
             names = [] if text in (ANY, NONE) else text.split("+")
             for name in names:
-                if name not in (*NAMES, *LOCAL) or len(names) > MOST_EFFECTS:
-                    raise unknown("effect", name, [ANY, NONE, *NAMES, *LOCAL], where)
+                if name not in ASKED or len(names) > MOST_EFFECTS:
+                    raise unknown("effect", name, [ANY, NONE, *ASKED], where)
         for instrument, effects, sites, seed in itertools.product(instruments, self.effects, self.sites, self.seeds):
             yield Laboratory(
                 instrument=instrument, effects=effects, sites=sites, seed=seed, part=self.part,

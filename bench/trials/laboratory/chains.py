@@ -100,15 +100,16 @@ class Chain:
         return shifts(self.sites, self.ends)
 
     @functools.cached_property
-    def frictions(self) -> Mapping[str, Callable[[ndarray], ndarray]]:
-        """Each force that follows the velocity, as a function of v (copies, N), by the name of its effect."""
+    def frictions(self) -> Mapping[str, Callable[[ndarray, ndarray], ndarray]]:
+        """Each force that follows the velocity, as a function of u and v (copies, N), by the name of its effect."""
         thin = self.size * self.fast * LAYER
         return {
-            "damping": lambda v: v,
-            "quadratic-drag": lambda v: np.abs(v) * v,
-            "dry-friction": lambda v: np.tanh(v / thin),
+            "damping": lambda _, v: v,
+            "quadratic-drag": lambda _, v: np.abs(v) * v,
+            "dry-friction": lambda _, v: np.tanh(v / thin),
+            "nonlinear-damping": lambda u, v: u**2 * v,
             **{
-                f"local-damping@{k}": lambda v, row=row: v * row  # type: ignore[misc]
+                f"local-damping@{k}": lambda _, v, row=row: v * row  # type: ignore[misc]
                 for k, row in enumerate(np.eye(self.sites))
             },
         }
@@ -137,6 +138,7 @@ class Chain:
             "onsite-quintic": lambda u: u**5,
             "constant-force": lambda u: np.ones_like(u),
             "next-neighbour": lambda u: u @ far.T,
+            "quadratic-coupling": lambda u: (u @ right.T) ** 2 - (u @ left.T) ** 2,
             "nonlinear-coupling": lambda u: (u @ right.T) ** 3 + (u @ left.T) ** 3,
             "asymmetric-coupling": lambda u: u @ skew.T,
             "gradient": lambda u: n + 0 * u,
@@ -165,7 +167,7 @@ class Chain:
             if name in self.forces:
                 total += value * self.forces[name](u)
             elif name in self.frictions:
-                total += value * self.frictions[name](v)
+                total += value * self.frictions[name](u, v)
             elif name.startswith("unequal-masses"):
                 masses.append((int(name.partition("@")[2]), value))
         for end in {name.removeprefix("drive.cos") for name in of if name.startswith("drive.cos")}:

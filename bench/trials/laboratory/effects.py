@@ -24,17 +24,22 @@ AT_ONE_SITE = ("defect", MASSES)
 # At one site or bond, too; put in where they are asked for.
 LOCAL_DRIVE, LOCAL_DAMPING, BOND = "local-drive", "local-damping", "bond-defect"
 LOCAL = (LOCAL_DRIVE, LOCAL_DAMPING, BOND)
-COUPLED = ("nonlinear-coupling", "asymmetric-coupling")
+# Of Fermi, Pasta and Ulam, and of van der Pol; put in where they are asked for.
+LOSS = "nonlinear-damping"
+CLASSIC = ("quadratic-coupling", LOSS)
+COUPLED = ("quadratic-coupling", "nonlinear-coupling", "asymmetric-coupling")
 MOST_EFFECTS = 5
 # What is asked for instead of names.
 ANY, NONE = "any", "none"
 DECLARED = {"onsite-linear": "u[n]", "onsite-cubic": "u[n]**3"}
 NAMES = (
     OFFSET, GAIN, CURVE, *TAKING, "onsite-linear", "onsite-quadratic", "onsite-cubic", "onsite-quintic", *AT_ONE_SITE,
-    *COUPLED, "next-neighbour", DRIVE, "constant-force",
+    "nonlinear-coupling", "asymmetric-coupling", "next-neighbour", DRIVE, "constant-force",
 )  # fmt: skip
 # How often each is drawn, where 1 is not given: what most recordings have.
 OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
+ASKED = (*NAMES, *LOCAL, *CLASSIC)
+"""Every effect that can be asked for."""
 HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
 """Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
 
@@ -128,7 +133,7 @@ def draw_ingredient(name: str, chain: Chain, reach: int, draw: np.random.Generat
     """
     inner = np.arange(reach, chain.sites - reach)
     site = int(draw.choice(inner[:-1] if name == BOND else inner))
-    sign = -1.0 if name in (*TAKING, LOCAL_DAMPING) else float(draw.choice([-1.0, 1.0]))
+    sign = -1.0 if name in (*TAKING, LOCAL_DAMPING, LOSS) else float(draw.choice([-1.0, 1.0]))
     if name == OFFSET:
         return _offset(chain, inner, draw)
     if name == GAIN:
@@ -178,6 +183,7 @@ def _unit(name: str, chain: Chain) -> tuple[float, float]:
         "bond-defect": (coupling, 0.5),
         "quadratic-drag": (1 / (slow * size * span), 5.0),
         "dry-friction": (size * slow / span, 0.8),
+        "nonlinear-damping": (1 / (size**2 * span), 8.0),
         "onsite-linear": (slow**2, 0.4),
         "onsite-quadratic": (slow**2 / size, 0.25),
         "onsite-cubic": (slow**2 / size**2, 0.4),
@@ -187,6 +193,7 @@ def _unit(name: str, chain: Chain) -> tuple[float, float]:
         "trap": (slow**2, 0.3),
         "defect": (slow**2, 0.4),
         "next-neighbour": (coupling, 0.15),
+        "quadratic-coupling": (coupling / size, 0.2),
         "nonlinear-coupling": (coupling / size**2, 0.3),
         "asymmetric-coupling": (coupling, 0.2),
     }[name]

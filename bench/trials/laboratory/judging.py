@@ -33,8 +33,9 @@ ONE_FOR_ALL = ("sensor-offset", "sensor-gain")
 OF_INSTRUMENT = {"drifting-zero": "sensor-drift"}
 # The power of the unit of u by which the parameters of effects grow, where it is not 0.
 POWERS = {
-    "onsite-quadratic": -1, "onsite-cubic": -2, "onsite-quintic": -4, "nonlinear-coupling": -2, "quadratic-drag": -1,
-    "dry-friction": 1, "constant-force": 1, "drive": 1, "local-drive": 1, "sensor-curve": -2, "sensor-gain": -1,
+    "onsite-quadratic": -1, "onsite-cubic": -2, "onsite-quintic": -4, "quadratic-coupling": -1,
+    "nonlinear-coupling": -2, "quadratic-drag": -1, "nonlinear-damping": -2, "dry-friction": 1, "constant-force": 1,
+    "drive": 1, "local-drive": 1, "sensor-curve": -2, "sensor-gain": -1,
 }  # fmt: skip
 # Labels of values that are no coefficient of a term, with the names that recordings have for them.
 NAMED = {"omega": "omega", "curve of u": "curve", "scale": "scale"}

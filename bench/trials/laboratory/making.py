@@ -21,9 +21,8 @@ import numpy as np
 
 from latticebench.bench.trials.laboratory.chains import Chain, draw_chain
 from latticebench.bench.trials.laboratory.effects import (
-    LOCAL,
+    ASKED,
     MOST_EFFECTS,
-    NAMES,
     OFFSET,
     OFTEN,
     Ingredient,
@@ -193,7 +192,7 @@ def _chosen(experiment: Experiment, wanted: _Wanted, draw: np.random.Generator) 
     """Return effects that the recording can tell apart, to first order; None where there are too few of them."""
     chain, reach = experiment.chain, experiment.reach
     if wanted.effects is not None:
-        if not set(wanted.effects) <= set(sensible(chain, reach, (*NAMES, *LOCAL))):
+        if not set(wanted.effects) <= set(sensible(chain, reach, ASKED)):
             return None
         return [draw_ingredient(name, chain, reach, draw) for name in wanted.effects]
     if wanted.count == 0:

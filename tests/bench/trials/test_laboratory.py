@@ -100,6 +100,7 @@ def test_what_a_recording_cannot_tell_from_an_effect_is_said_beside_it() -> None
     "names",
     [
         ["damping", "next-neighbour", "nonlinear-coupling", "quadratic-drag"],
+        ["quadratic-coupling", "nonlinear-damping"],
         pytest.param(["asymmetric-coupling", "constant-force", "onsite-quintic"], marks=pytest.mark.slow),
     ],
 )
