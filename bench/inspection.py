@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.noise import centred
-from latticebench.bench.report.notes import strays
+from latticebench.bench.report.notes import at_ends, strays
 from latticebench.diagnosis.instrument import of_readings, step_of
 from latticebench.diagnosis.problem import Spectrum
 from latticebench.methods.engine.dynamics import split_parts
@@ -27,8 +27,6 @@ ANGLE = 10.0
 PERIODIC = ("sin", "cos", "tan")
 # A step between readings this many times the usual one is a gap.
 GAP = 2.5
-# Readings at the very end of a range are clipped where there are so many, and so many times those at the next level.
-CLIPPED, CROWDED = 5, 4
 # A share of the noise's variance that makes rounding worth a word.
 ROUNDED = 0.5
 # Readings in a period, and periods in a record, below which little can be told.
@@ -141,7 +139,8 @@ def _suspicious(
         elif np.ptp(values) == 0:
             yield f"{one.name}: always {one.most:g}; does this sensor work?"
         else:
-            yield from _at_ends(one, values / samples.origin.scale)
+            for level, count, end in at_ends(values / samples.origin.scale):
+                yield f"{one.name}: {count} readings of just {level:g} and none {end}; are they clipped?"
             if one.noise > 0 and one.step**2 / 12 > ROUNDED * one.noise**2:
                 yield f"{one.name}: readings come in steps of {one.step:.3g}; rounding makes most of the noise"
         for other in range(site):
@@ -154,14 +153,6 @@ def _suspicious(
             yield f"{1 / max(peaks) / usual:.2g} readings in a period of the fastest line; {SPARSE:g} are few"
         if span * min(peaks) < SHORT:
             yield f"{span * min(peaks):.2g} periods of the slowest line; {SHORT:g} or more tell damping from noise"
-
-
-def _at_ends(one: Sensor, values: ndarray) -> Iterator[str]:
-    """Yield where readings crowd at an end of the range."""
-    levels, counts = np.unique(values, return_counts=True)
-    for level, count, beside, end in ((levels[-1], counts[-1], counts[-2], "above"), (levels[0], *counts[:2], "below")):
-        if count >= CLIPPED and count > CROWDED * beside:
-            yield f"{one.name}: {count} readings of just {level:g} and none {end}; are they clipped?"
 
 
 def _of_terms(samples: Samples, terms: Library | None) -> Iterator[str]:

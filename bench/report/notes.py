@@ -12,12 +12,31 @@ from latticebench.diagnosis.instrument import step_of
 from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
     from latticebench.diagnosis.repair import Diagnosis
 
 # Rounding that makes less of the noise's variance than this is not worth a word.
 ROUNDING = 0.01
 # So many times as far from the middle as any other reading of its site is no reading of the motion.
 STRAY = 10.0
+# Readings at the very end of a range are clipped where there are so many, and so many times those at the next level.
+CLIPPED, CROWDED = 5, 4
+
+
+def at_ends(values: Float[ndarray, " values"]) -> Iterator[tuple[float, int, str]]:
+    """Yield the levels at which readings crowd at an end of their range, how many they are, and which end it is.
+
+    Args:
+        values: readings of one sensor, none of them missing.
+    """
+    levels, counts = np.unique(values, return_counts=True)
+    if len(levels) < 2:
+        return
+    for level, count, beside, end in ((levels[-1], *counts[:-3:-1], "above"), (levels[0], *counts[:2], "below")):
+        if count >= CLIPPED and count > CROWDED * beside:
+            yield float(level), int(count), end
 
 
 def strays(samples: Samples) -> list[str]:
@@ -49,6 +68,7 @@ def notes(diagnosis: Diagnosis) -> tuple[str, ...]:
 def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
     for samples in diagnosis.data:
         yield from strays(samples)
+        yield from _clipped(samples)
     yield from _steps(diagnosis)
     used, recorded = diagnosis.used
     if used < recorded:
@@ -58,6 +78,17 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
         )
     if diagnosis.inputs:
         yield f"Between its samples the measured input was taken as {diagnosis.inputs}, which the readings suit best."
+
+
+def _clipped(samples: Samples) -> Iterator[str]:
+    """Yield which sensors may be clipped."""
+    for site in range(samples.sites):
+        values = _parts(samples.u[:, site]) / samples.origin.scale
+        for level, count, end in at_ends(values[np.isfinite(values)]):
+            yield (
+                f"{samples.source}: {count} readings of u{site + 1} are just {level:g} and none is {end}. If the "
+                "sensor is clipped there, leave these cells empty: they were taken as readings."
+            )
 
 
 def _steps(diagnosis: Diagnosis) -> Iterator[str]:

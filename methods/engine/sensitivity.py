@@ -302,12 +302,13 @@ class Stretches:
                 # An input that is held jumps from one step to the next: each sees its own side.
                 inside = begin + (step + 0.5 + INSIDE * (c[stage] - 0.5)) * h
                 f = None if self.inputs is None else self.inputs(inside)
+                curve = None if curves is None else curves[stage]
                 rate, values, slopes = self.dynamics.linear(
-                    coefficients, t, at_y, f, curves and curves[stage], derivatives=z is not None, step=h
+                    coefficients, t, at_y, f, curve, derivatives=z is not None, step=h
                 )
                 slopes_y[stage] = rate
                 if slopes_z is not None:
-                    at = basis and basis[stage]
+                    at = None if basis is None else basis[stage]
                     self._vary_rate(slopes_z[stage], at_z, values, slopes, at, chosen, by_terms=by_terms)
             y = y + h[:, None] * _combine(b, slopes_y)
             if z is not None:

@@ -150,3 +150,20 @@ def test_the_demo_finds_what_it_put_in(typed: Typed, tmp_path: Path) -> None:
     assert "damping: amplitudes fall" in shown
     assert "tried/diagnosis.html" in shown
     assert "<svg" in (tmp_path / "tried" / "diagnosis.html").read_text(encoding="utf-8")
+
+
+def test_a_diagnosis_points_at_clipped_readings_and_holds_to_the_noise_once_they_are_left_out(
+    typed: Typed, tmp_path: Path
+) -> None:
+    t = np.arange(0, 40, 0.1)
+    swing = np.exp(-0.025 * t) * np.cos(2 * t) + 0.005 * np.random.default_rng(3).standard_normal(len(t))
+    words = ["--terms", "u[n]", "--order", "2", "--ends", "free", "--json", "-"]
+    found = {}
+    for name, beyond in (("clipped", 0.8), ("empty", np.nan)):
+        u = np.where(swing > 0.8, beyond, swing)
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack([t, u]), "%.6f", ",", header="t,u1", comments="")
+        found[name] = json.loads(typed("diagnose", f"{name}.csv", *words)[0])
+    told = [any("are just 0.8 and none is above" in line for line in one["notes"]) for one in found.values()]
+    assert told == [True, False]
+    assert found["empty"]["error"]["rms"]["after"] == pytest.approx(0.005, rel=0.1)
+    assert [one["effect"] for one in found["empty"]["effects"]] == ["damping"]
