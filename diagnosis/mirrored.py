@@ -12,7 +12,8 @@ import numpy as np
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.problem import Problem, regressed, turned
+from latticebench.diagnosis.problem import Problem, turned
+from latticebench.diagnosis.regression import regressed
 from latticebench.diagnosis.worth import COUPLING, repelling
 
 if TYPE_CHECKING:

@@ -90,6 +90,12 @@ class Spectrum:
         tall = peaks[total[peaks] > max(ABOVE * floor, SHARE * float(np.max(total)))]
         return cls(omega, total, omega[tall[np.argsort(-total[tall])]])
 
+    def between(self, peak: float) -> float:
+        """Return the frequency of a peak by the parabola through the logarithms of the power beside it."""
+        k = int(np.searchsorted(self.omega, peak))
+        low, high, beyond = np.log(self.power[k - 1 : k + 2])
+        return float(peak + (self.omega[1] - self.omega[0]) * (low - beyond) / (2 * (low - 2 * high + beyond)))
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -409,46 +415,6 @@ def turned(problem: Problem, site: int) -> Problem:
     sign[site] = -1.0
     own = np.tile(sign[problem.plain.moving], problem.chain.order * problem.chain.parts)
     return replace(problem, nodes=tuple(nodes * own for nodes in problem.nodes))
-
-
-def regressed(problem: Problem) -> tuple[tuple[float, ...], float]:
-    """Return the declared coefficients that carry the smoothed states over a quarter of the shortest period.
-
-    Each site has a constant force besides, so that a sensor's offset does no harm. With the coefficients comes the
-    share of the forces' work that they leave (root mean square).
-
-    Raises:
-        InputError: a declared term is not finite along them.
-    """
-    from scipy.interpolate import make_interp_spline
-
-    designs, targets = [], []
-    window = max(1, round(np.pi / 2 / problem.top / problem.step))
-    for record, nodes, splines in zip(problem.records, problem.nodes, problem.splines, strict=True):
-        stretches, dynamics = record.stretches, problem.plain
-        f = None if stretches.inputs is None else stretches.inputs(record.times)
-        driven = stretches.driven(record.times, splines)
-        zero = np.zeros(len(dynamics.terms))
-        values = dynamics.linear(zero, record.times, nodes, f, driven, derivatives=False)[1]
-        for term, sound in zip(dynamics.terms, np.isfinite(values).all(axis=(0, 2, 3)), strict=True):
-            if not sound:
-                raise InputError(f"the declared term {term.text} is infinite along the readings; check their unit")
-        curve = make_interp_spline(record.times, np.moveaxis(values, 2, 0), k=min(3, len(record.times) - 1))
-        total = curve.antiderivative()(record.times)
-        rate = nodes.reshape(len(nodes), dynamics.order, dynamics.parts, dynamics.count)[:, -1]
-        # No window holds a gap.
-        whole = record.times[window:] - record.times[:-window] < GAP * window * problem.step
-        flow = np.moveaxis(total[window:] - total[:-window], 2, -1)[whole]
-        flow = flow - np.mean(flow, axis=0)
-        designs.append(flow.reshape(-1, values.shape[1]))
-        gone = (rate[window:] - rate[:-window])[whole]
-        targets.append((gone - np.mean(gone, axis=0)).ravel())
-    design, target = np.concatenate(designs), np.concatenate(targets)
-    size = np.sqrt(np.mean(design**2, axis=0))
-    size[size == 0] = 1.0
-    found = np.linalg.lstsq(design / size, target, rcond=1e-6)[0] / size
-    left = float(np.linalg.norm(target - design @ found) / max(float(np.linalg.norm(target)), 1e-300))
-    return tuple(float(one) for one in found), left
 
 
 def derivative_share(problem: Problem, motion: Sequence[ndarray], right: Sequence[ndarray]) -> float:

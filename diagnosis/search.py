@@ -25,8 +25,9 @@ from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
 from latticebench.diagnosis.noise_estimate import estimate
 from latticebench.diagnosis.past import past_of, settled
-from latticebench.diagnosis.problem import Problem, regressed
+from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.progress import Found, Horizon, Tried
+from latticebench.diagnosis.regression import regressed, sustained
 from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, same, wald
@@ -79,7 +80,7 @@ class Search:
         """Yield what was found on each horizon, from short pieces to whole recordings."""
         done: tuple[Horizon, ...] = ()
         last: Found | None = None
-        stuck = False
+        stuck = opened = False
         shortest = 2 * np.pi / self.problem.top / self.problem.step
         length = max(int(rules.FIRST_HORIZON * shortest), self._least)
         carried = self._first(length)
@@ -93,6 +94,10 @@ class Search:
             late = whole or stuck or waves >= rules.PERIODS or strays
             self.open = tuple(one for one in self.problem.candidates if late or not one.timed)
             before, fits = carried[0], list(carried[1:])
+            if late and not opened:
+                begun = (self._begun(one, self.problem, fits[0].layout) for one in sustained(self.problem))
+                fits += [one for one in begun if one is not None]
+            opened = late
             self.say(f"following pieces of {waves:.3g} periods")
             best = self._level(fits, before)
             base = self.value(best[0])

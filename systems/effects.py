@@ -197,6 +197,11 @@ CATALOGUE: tuple[Effect, ...] = (
         source="Fermi, Pasta & Ulam, Studies of Nonlinear Problems, Los Alamos LA-1940 (1955)",
     ),
     Effect(
+        "bond-damping", "v[n+1]+v[n-1]-2*v[n]", orders=(2,), real=True,
+        look_for="short waves that fade faster than long ones; a motion all alike does not",
+        source="Landau & Lifshitz, Theory of Elasticity (1970), viscosity of solids",
+    ),
+    Effect(
         "nonlinear-coupling", "(u[n+1]-u[n])**3+(u[n-1]-u[n])**3",
         complex_field="abs(u[n+1]-u[n])**2*(u[n+1]-u[n])+abs(u[n-1]-u[n])**2*(u[n-1]-u[n])",
         look_for="a residual where neighbours differ most", source="Flach & Gorbach, Phys. Rep. 467, 1 (2008)",

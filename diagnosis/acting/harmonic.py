@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -16,6 +16,7 @@ from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     from numpy import ndarray
+    from typing_extensions import Self
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,10 @@ class Harmonic(Placed, acts="harmonic"):
     def frequency(self) -> float:
         """The angular frequency."""
         return self.omega
+
+    def tuned(self, frequency: float) -> Self:
+        """Return it at another angular frequency."""
+        return replace(self, omega=frequency)
 
     def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:
         """Return the waves at the next frequencies to both sides, without those in the line that this one makes."""

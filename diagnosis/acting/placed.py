@@ -237,6 +237,10 @@ class Placed(ABC):
         """The angular frequency at which it swings; None where it has none of its own."""
         return None
 
+    def tuned(self, frequency: float) -> Self:  # noqa: ARG002
+        """Return it at another angular frequency, where it has one."""
+        return self
+
     def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:  # noqa: ARG002
         """Return those of its kind that act nearly, but plainly not as it does; none where no such order is known."""
         return ()

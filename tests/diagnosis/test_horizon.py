@@ -15,7 +15,8 @@ from latticebench.diagnosis.fitting import fit
 from latticebench.diagnosis.horizon import Layout, follow, unread
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
-from latticebench.diagnosis.problem import LONG, WINDOWS, Problem, regressed, thinned, windows
+from latticebench.diagnosis.problem import LONG, WINDOWS, Problem, thinned, windows
+from latticebench.diagnosis.regression import regressed
 from latticebench.diagnosis.worth import Worth, misfits
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.lattice import library

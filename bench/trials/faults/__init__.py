@@ -56,14 +56,13 @@ def _misread(function: Callable[[Setting, float], Fields]) -> Fault:
 
 SECOND_ORDER = (
     "other: cubic-drag",
-    "other: friction-between",
     "other: wavy-drag",
     # For order 1 this would be disorder, and the next one asymmetric coupling.
     "other: absorbing-ends",
     "other: gyroscopic-bonds",
 )
 COMPLEX = ("other: phase-conjugation", "other: nonlocal-response")
-REAL = ("damping", "nonlinear-damping", "nonlinear-loss", "gain-loss", "disorder")
+REAL = ("damping", "bond-damping", "nonlinear-damping", "nonlinear-loss", "gain-loss", "disorder")
 
 
 def _pushing(names: dict[str, Callable[[pushes.Moment], np.ndarray]]) -> dict[str, Fault]:

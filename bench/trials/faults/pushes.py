@@ -150,6 +150,7 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "kick": lambda m: m.pulse() * np.ones(len(m.u)),
     "next-neighbour": lambda m: m.stretch(2) + m.stretch(-2),
     "quadratic-coupling": lambda m: m.stretch(1) ** 2 - m.stretch(-1) ** 2,
+    "bond-damping": between,
     "nonlinear-coupling": lambda m: (
         np.abs(m.stretch(1)) ** 2 * m.stretch(1) + np.abs(m.stretch(-1)) ** 2 * m.stretch(-1)
     ),
@@ -169,7 +170,6 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
 # Outside the catalogue; those called wavy and uneven have a form that is drawn, so that no list of terms can hold it.
 PLAIN: dict[str, Callable[[Moment], ndarray]] = {
     "other: cubic-drag": lambda m: -(m.v**3),
-    "other: friction-between": between,
     "other: drifting-stiffness": lambda m: (m.t - m.drawn.about["middle"]) * m.u,
     "other: noise-force": lambda m: np.sum(np.cos(m.drawn.omegas * m.t + m.drawn.phases), axis=0),
     "other: saturation": lambda m: m.u / (1 + 4 * np.abs(m.u) ** 2) if m.chain.is_complex else np.cos(3 * m.u),

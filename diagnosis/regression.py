@@ -1,0 +1,123 @@
+"""Where a search begins: numbers of a model by regression over smoothed readings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.acting import Placed
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.problem import GAP, Problem
+from latticebench.systems.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
+# The strongest lines of the spectrum that a force from outside may sustain, and how many of them at once.
+LINES, AT_ONCE = 4, 3
+
+
+def regressed(problem: Problem) -> tuple[tuple[float, ...], float]:
+    """Return the declared coefficients that carry the smoothed states over a quarter of the shortest period.
+
+    Each site has a constant force besides, so that a sensor's offset does no harm. With the coefficients comes the
+    share of the forces' work that they leave (root mean square).
+
+    Raises:
+        InputError: a declared term is not finite along them.
+    """
+    design, target = _carrying(problem)
+    found, left = _solved(design, target)
+    return tuple(found.tolist()), left
+
+
+def sustained(problem: Problem) -> list[Model]:
+    """Return the declared equation with forces from outside at lines of the spectrum, each model with one line more.
+
+    A steady swing may be the chain's own or a force's. Where forces make the strongest lines, coefficients that take
+    these for the chain's own are far from right, and no short way leads from them to those that are.
+
+    Raises:
+        InputError: a declared term is not finite along the smoothed states.
+    """
+    waves: dict[tuple[object, ...], Placed] = {}
+    for one in problem.candidates:
+        if one.frequency is not None:
+            waves.setdefault(one.place, one)
+    lines = [problem.spectrum.between(peak) for peak in problem.spectrum.peaks[:LINES]]
+    offered = [one.tuned(line) for line in lines for one in waves.values()]
+    plain = Model(problem.declared, problem.order, (0.0,) * len(problem.declared.terms), tuple(offered))
+    design, target = _carrying(problem, offered)
+    columns = [
+        np.arange(block.start, block.start + len(one.strength))
+        for one, block in zip(offered, plain.blocks, strict=True)
+    ]
+    kept = np.arange(len(plain.coefficients))
+    chosen: list[int] = []
+    found: list[Model] = []
+    while len(chosen) < AT_ONCE:
+        taken = {offered[k].frequency for k in chosen}
+        done = np.linalg.qr(design[:, kept])[0]
+        left, more = (one - done @ (done.T @ one) for one in (target, design))
+        shares = {
+            k: _solved(more[:, columns[k]], left)[1] for k, one in enumerate(offered) if one.frequency not in taken
+        }
+        best = min(shares, key=lambda k: shares[k], default=None)
+        if best is None or shares[best] > 1 - rules.SHARE:
+            break
+        chosen.append(best)
+        kept = np.concatenate([kept, columns[best]])
+        numbers = plain.numbers
+        numbers[kept] = _solved(design[:, kept], target)[0]
+        model = plain.moved(numbers)
+        found.append(replace(model, effects=tuple(model.effects[k] for k in chosen)))
+    return found
+
+
+def _solved(design: Float[ndarray, "rows numbers"], target: Float[ndarray, " rows"]) -> tuple[ndarray, float]:
+    """Return the solution of least squares, and the share of the target that it leaves (root mean square)."""
+    size = np.sqrt(np.mean(design**2, axis=0))
+    size[size == 0] = 1.0
+    found = np.linalg.lstsq(design / size, target, rcond=1e-6)[0] / size
+    left = float(np.linalg.norm(target - design @ found) / max(float(np.linalg.norm(target)), 1e-300))
+    return found, left
+
+
+def _carrying(problem: Problem, effects: Sequence[Placed] = ()) -> tuple[ndarray, ndarray]:
+    """Return what each number of a model would carry the smoothed states by, and by what they are carried.
+
+    That is over a quarter of the shortest period, at each site less its mean: (rows, numbers) and (rows,).
+    """
+    from scipy.interpolate import make_interp_spline
+
+    model = Model(problem.declared, problem.order, (0.0,) * len(problem.declared.terms), tuple(effects))
+    designs, targets = [], []
+    window = max(1, round(np.pi / 2 / problem.top / problem.step))
+    for number, (record, nodes, splines) in enumerate(
+        zip(problem.records, problem.nodes, problem.splines, strict=True)
+    ):
+        assembled = model.assembled(problem.plain, problem.chain, number)
+        stretches, dynamics = record.stretches, assembled.dynamics
+        f = None if stretches.inputs is None else stretches.inputs(record.times)
+        driven = stretches.driven(record.times, splines)
+        values = dynamics.linear(assembled.coefficients, record.times, nodes, f, driven, derivatives=False)[1]
+        for term, sound in zip(problem.plain.terms, np.isfinite(values).all(axis=(0, 2, 3)), strict=False):
+            if not sound:
+                raise InputError(f"the declared term {term.text} is infinite along the readings; check their unit")
+        values = np.einsum("tk,ptbm->bpkm", assembled.slope, values, optimize=True)
+        curve = make_interp_spline(record.times, values, k=min(3, len(record.times) - 1))
+        total = curve.antiderivative()(record.times)
+        rate = nodes.reshape(len(nodes), dynamics.order, dynamics.parts, dynamics.count)[:, -1]
+        # No window holds a gap.
+        whole = record.times[window:] - record.times[:-window] < GAP * window * problem.step
+        flow = np.moveaxis(total[window:] - total[:-window], 2, -1)[whole]
+        flow = flow - np.mean(flow, axis=0)
+        designs.append(flow.reshape(-1, flow.shape[-1]))
+        gone = (rate[window:] - rate[:-window])[whole]
+        targets.append((gone - np.mean(gone, axis=0)).ravel())
+    return np.concatenate(designs), np.concatenate(targets)
