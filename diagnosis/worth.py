@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 COUPLING = "u[n+1]+u[n-1]-2*u[n]"
 # Models whose costs and readings differ by less (nats; share of the noise) are one model said in two ways.
 SAME_COST, SAME_READING = 0.3, 0.05
-# A size of u that does not matter: a share of the readings at first, then of the noise, and at least the last share of
-# the readings: where these have no noise, a thousand of the integrator's errors together are no force.
+# A size of u that does not matter: a share of the readings at first, then of the noise, but at least the last share of
+# the readings. Of thousands of readings without noise the integrator's errors would otherwise look like forces.
 SMALL_SHARE, SMALL_NOISE, SMALLEST = 1e-3, 0.1, 1e-8
 
 

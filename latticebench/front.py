@@ -26,6 +26,7 @@ from latticebench.bench import calls
 from latticebench.bench.overlay import of_diagnosis
 from latticebench.bench.report.rows import html_table
 from latticebench.exhibit import Exhibit
+from latticebench.pictures import FROM_PYTHON
 from latticebench.recording import Model, Recording
 from latticebench.systems.errors import InputError
 
@@ -338,7 +339,7 @@ def run(
     choice = chosen(only, map(str, methods), seeds)
     loaded = load(str(suite), choice=choice)
     place = Path(folder) if folder is not None else Path("runs") / loaded.name
-    about = {"suite": loaded.name, "jobs": jobs, "chosen": str(choice)}
+    about = {"command": FROM_PYTHON, **loaded.about, "jobs": jobs, "chosen": str(choice)}
     _, tally = run_suite(loaded, create(place), jobs=jobs, about=about)
     return Run(place, dict(tally.statuses))
 

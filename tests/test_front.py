@@ -12,6 +12,7 @@ import pytest
 
 import latticebench as lb
 from latticebench import fitted, front, pictures, recording
+from latticebench.bench import calls
 from latticebench.systems.errors import InputError
 from latticebench.systems.simulate import simulate
 
@@ -217,6 +218,27 @@ def test_a_bound_and_a_diagnosis_are_objects_with_tables():
     assert cause.model.terms.startswith("sin(u[n])")
     assert "<iframe" in cause._repr_html_()
     assert repr(cause).startswith(cause.report.sentence)
+
+
+def test_a_diagnosis_takes_effects_of_ones_own_and_forecasts_another_recording(tmp_path):
+    (tmp_path / "mine.toml").write_text('[[effect]]\nname = "my-force"\nformula = "u[n]**7"\n')
+    t = np.arange(0, 12, 0.1)
+    first, later = (lb.read((t, 0.05 * np.cos(2 * t + phase) + 1e-3 * np.sin(97 * t))) for phase in (0, 1))
+    cause = lb.diagnose(first, PENDULUM, effects=tmp_path / "mine.toml", holdout=later)
+    assert "my-force" in [one.effect for one in cause.report.horizons[-1].tried]
+    assert [len(one.t) for one in cause.result.data] == [len(t)]
+    with pytest.raises(InputError):
+        lb.diagnose(first, PENDULUM, holdout=lb.read((t, np.stack([np.cos(t), np.sin(t)], axis=1))))
+
+
+def test_an_interrupted_diagnosis_returns_what_it_knows():
+    def stop(text):
+        if "without" in text or "no name" in text:
+            raise KeyboardInterrupt
+
+    _, report = calls.diagnose(PENDULUM.of(swing()), PENDULUM.library, 2, watcher=stop)
+    assert report.interrupted
+    assert len(report.horizons) > 0
 
 
 def test_tables_that_were_published_are_frames_of_numbers():
