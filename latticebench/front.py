@@ -231,7 +231,8 @@ class Tables(dict[str, pd.DataFrame]):
         return f"Tables({', '.join(f'{name}: {len(frame)} rows' for name, frame in self.items())})"
 
     def _repr_html_(self) -> str:
-        return "".join(f"<p>{html.escape(name)}</p>{html_table(frame.head())}" for name, frame in self.items())
+        rows = [(name, len(frame), ", ".join(map(str, frame.columns))) for name, frame in self.items()]
+        return html_table(pd.DataFrame(rows, columns=["table", "rows", "columns"]))
 
 
 def results(name: str | Path) -> Tables:

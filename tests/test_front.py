@@ -244,6 +244,7 @@ def test_an_interrupted_diagnosis_returns_what_it_knows():
 def test_tables_that_were_published_are_frames_of_numbers():
     found = lb.results("paper")
     assert found["cases"]["e2"].dtype.kind == "f"
+    assert found._repr_html_().count("<tr") == len(found) + 1
     with pytest.raises(InputError, match="no published tables"):
         lb.results("nothing")
 
