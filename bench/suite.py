@@ -56,7 +56,7 @@ from latticebench.bench.choice import Choice
 from latticebench.bench.effort import check_cases, check_size
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.grid import Contestant, Grid
-from latticebench.methods.method import check_fit, make
+from latticebench.methods.method import check_fit, make, settings
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import check_regular
 from latticebench.systems.lattice import System, library
@@ -105,6 +105,22 @@ class Suite:
     def cases(self) -> tuple[Case, ...]:
         """The cases in the order in which they run; no two are the same."""
         return tuple(self.by_identity.values())
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What is told of it with its results: its name, and what each label stands for with all its settings.
+
+        Of others' code, which is imported by workers alone, these are the settings that are given.
+        """
+        written = {}
+        for label, one in self.contestants.items():
+            values: dict[str, Any] = dict(one.settings)
+            if code_file(one.method) is None and one.method not in methods.brought():
+                kind = methods.find(one.method)
+                chosen = make(kind, one.settings)
+                values = {name: getattr(chosen, name) for name in settings(kind)}
+            written[label] = ", ".join([one.method, *(f"{n}={v}" for n, v in values.items() if v is not None)])
+        return {"suite": self.name, **({"settings": written} if written else {})}
 
 
 def names() -> list[str]:

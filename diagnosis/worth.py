@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 COUPLING = "u[n+1]+u[n-1]-2*u[n]"
 # Models whose costs and readings differ by less (nats; share of the noise) are one model said in two ways.
 SAME_COST, SAME_READING = 0.3, 0.05
-# A size of u that does not matter: a share of the readings at first, then of the noise.
-SMALL_SHARE, SMALL_NOISE = 1e-3, 0.1
+# A size of u that does not matter: a share of the readings at first, then of the noise, but at least the last share of
+# the readings. Of thousands of readings without noise the integrator's errors would otherwise look like forces.
+SMALL_SHARE, SMALL_NOISE, SMALLEST = 1e-3, 0.1, 1e-8
 
 
 def over(problem: Problem, fitted: Fitted) -> Float[ndarray, " sensors"]:
@@ -46,7 +47,7 @@ def fine(problem: Problem, fitted: Fitted | None = None) -> float:
     if fitted is None:
         return SMALL_SHARE * problem.height
     least = min(float(np.nanmin(fitted.rms)), float(np.nanmin(fitted.noise.deviation())))
-    return max(SMALL_NOISE * least, 1e-3 * SMALL_SHARE * problem.height)
+    return max(SMALL_NOISE * least, SMALLEST * problem.height)
 
 
 def lost(problem: Problem, fitted: Fitted) -> bool:

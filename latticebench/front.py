@@ -26,6 +26,7 @@ from latticebench.bench import calls
 from latticebench.bench.overlay import of_diagnosis
 from latticebench.bench.report.rows import html_table
 from latticebench.exhibit import Exhibit
+from latticebench.pictures import FROM_PYTHON
 from latticebench.recording import Model, Recording
 from latticebench.systems.errors import InputError
 
@@ -230,7 +231,8 @@ class Tables(dict[str, pd.DataFrame]):
         return f"Tables({', '.join(f'{name}: {len(frame)} rows' for name, frame in self.items())})"
 
     def _repr_html_(self) -> str:
-        return "".join(f"<p>{html.escape(name)}</p>{html_table(frame.head())}" for name, frame in self.items())
+        rows = [(name, len(frame), ", ".join(map(str, frame.columns))) for name, frame in self.items()]
+        return html_table(pd.DataFrame(rows, columns=["table", "rows", "columns"]))
 
 
 def results(name: str | Path) -> Tables:
@@ -338,7 +340,7 @@ def run(
     choice = chosen(only, map(str, methods), seeds)
     loaded = load(str(suite), choice=choice)
     place = Path(folder) if folder is not None else Path("runs") / loaded.name
-    about = {"suite": loaded.name, "jobs": jobs, "chosen": str(choice)}
+    about = {"command": FROM_PYTHON, **loaded.about, "jobs": jobs, "chosen": str(choice)}
     _, tally = run_suite(loaded, create(place), jobs=jobs, about=about)
     return Run(place, dict(tally.statuses))
 

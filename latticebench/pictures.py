@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # Dots per inch of a picture in a notebook.
 DENSITY = 100
+# The command that made a picture or a table.
+FROM_PYTHON = "from Python"
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,7 @@ class Film:
 
 
 def _about() -> dict[str, Any]:
-    return {"command": "from Python", **origin()}
+    return {"command": FROM_PYTHON, **origin()}
 
 
 def _image(content: bytes, kind: str, text: str) -> str:

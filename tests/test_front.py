@@ -12,6 +12,7 @@ import pytest
 
 import latticebench as lb
 from latticebench import fitted, front, pictures, recording
+from latticebench.bench import calls
 from latticebench.systems.errors import InputError
 from latticebench.systems.simulate import simulate
 
@@ -189,11 +190,11 @@ def test_a_fit_of_degrees_warns_before_anything_else_and_names_a_remedy():
     assert "<b>Warning:</b>" in found._repr_html_()
 
 
-@pytest.mark.parametrize("damping", [0, 1e-3])
-def test_readings_without_noise_do_not_contradict_themselves(damping):
+@pytest.mark.parametrize(("damping", "sites", "span"), [(0, 31, 20), (1e-3, 21, 10)])
+def test_readings_without_noise_do_not_contradict_themselves(damping, sites, span):
     known = lb.systems.find("sine-gordon")
     moved = replace(known, equation=f"{known.equation} - {damping}*v[n]")
-    samples = simulate(moved, parameters={"C": 0.5, "v": 0.5}, sites=21)
+    samples = simulate(moved, parameters={"C": 0.5, "v": 0.5}, sites=sites, times=np.arange(0, span, 0.2))
     cause = lb.diagnose(lb.Recording((samples,)), lb.system("sine-gordon"))
     assert cause.verdict == ("explained" if damping else "nothing missing")
     assert set(cause.effects["effect"]) == ({"damping"} if damping else set())
@@ -219,9 +220,31 @@ def test_a_bound_and_a_diagnosis_are_objects_with_tables():
     assert repr(cause).startswith(cause.report.sentence)
 
 
+def test_a_diagnosis_takes_effects_of_ones_own_and_forecasts_another_recording(tmp_path):
+    (tmp_path / "mine.toml").write_text('[[effect]]\nname = "my-force"\nformula = "u[n]**7"\n')
+    t = np.arange(0, 12, 0.1)
+    first, later = (lb.read((t, 0.05 * np.cos(2 * t + phase) + 1e-3 * np.sin(97 * t))) for phase in (0, 1))
+    cause = lb.diagnose(first, PENDULUM, effects=tmp_path / "mine.toml", holdout=later)
+    assert "my-force" in [one.effect for one in cause.report.horizons[-1].tried]
+    assert [len(one.t) for one in cause.result.data] == [len(t)]
+    with pytest.raises(InputError):
+        lb.diagnose(first, PENDULUM, holdout=lb.read((t, np.stack([np.cos(t), np.sin(t)], axis=1))))
+
+
+def test_an_interrupted_diagnosis_returns_what_it_knows():
+    def stop(text):
+        if "without" in text or "no name" in text:
+            raise KeyboardInterrupt
+
+    _, report = calls.diagnose(PENDULUM.of(swing()), PENDULUM.library, 2, watcher=stop)
+    assert report.interrupted
+    assert len(report.horizons) > 0
+
+
 def test_tables_that_were_published_are_frames_of_numbers():
     found = lb.results("paper")
     assert found["cases"]["e2"].dtype.kind == "f"
+    assert found._repr_html_().count("<tr") == len(found) + 1
     with pytest.raises(InputError, match="no published tables"):
         lb.results("nothing")
 

@@ -94,8 +94,7 @@ def run(
         return
     _tell_hours(suite, loaded.cases[part.first - 1 :: part.step], jobs, yes)
     store = create(folder)
-    about: dict[str, Any] = {"command": command_line(), "suite": loaded.name, "chosen": str(choice)}
-    about |= {"settings": _contestants(loaded)} if loaded.contestants else {}
+    about = {"command": command_line(), **loaded.about, "chosen": str(choice)}
     with _executor(where, loaded, folder, jobs, any_processor) as one:
         tally = _run(loaded, store, one, part, retry, {**about, **one.about})
     title = loaded.title
@@ -251,20 +250,3 @@ def shard_of(text: str | None, cases: int) -> Shard:
     if int(found[1]) > cases:
         raise InputError(f"--shard {text}: there is no case {found[1]}, the suite has {cases}")
     return Shard(int(found[1]), int(found[2]))
-
-
-def _contestants(suite: Suite) -> dict[str, str]:
-    """Return what each label of a suite stands for, with all its settings; of others' code, with those given."""
-    from latticebench import methods
-    from latticebench.bench.case import code_file
-    from latticebench.methods.method import make, settings
-
-    written = {}
-    for label, one in suite.contestants.items():
-        values: dict[str, Any] = dict(one.settings)
-        if code_file(one.method) is None and one.method not in methods.brought():
-            kind = methods.find(one.method)
-            chosen = make(kind, one.settings)
-            values = {name: getattr(chosen, name) for name in settings(kind)}
-        written[label] = ", ".join([one.method, *(f"{n}={v}" for n, v in values.items() if v is not None)])
-    return written

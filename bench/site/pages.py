@@ -18,6 +18,8 @@ from latticebench.bench.report.content import DiagnosisDocument
 from latticebench.bench.site.folders import Folder, Table, is_numeric, value_of
 from latticebench.bench.site.prose import rendered
 from latticebench.bench.site.suites import View, of_fits, of_trials
+from latticebench.bench.suite import file_of, names
+from latticebench.systems.toml import read_toml
 
 if TYPE_CHECKING:
     import jinja2
@@ -264,6 +266,14 @@ def _heading(text: str) -> str:
     return first.lstrip("# ") if first.startswith("#") else ""
 
 
+def _purpose(about: Mapping[str, str]) -> list[str]:
+    """Return what a suite of this package is for, by the command that ran it; nothing of another."""
+    name = about.get("suite", "")
+    if name not in names() or not about.get("command", "").startswith(f"latticebench run {name} "):
+        return []
+    return [str(read_toml(file_of(name))["title"])]
+
+
 def _file(folder: Folder, name: str) -> Link:
     """Return the link from a page of a folder to the copy of a file of it."""
     size = (folder.path / name).stat().st_size
@@ -287,7 +297,7 @@ def _card(folder: Folder, above: tuple[str, ...] = ()) -> dict[str, Any]:
     about = next((dict(one.about) for one in folder.tables.values() if one.about), {})
     return {
         "link": Link(quote(f"{'/'.join(folder.parts[len(above) :])}/index.html"), folder.parts[-1]),
-        "texts": [_heading(text) for text in folder.texts.values() if _heading(text)],
+        "texts": _purpose(about) or [_heading(text) for text in folder.texts.values() if _heading(text)],
         "held": [one for one in held if one], "about": [(name, about[name]) for name in SAID if name in about],
         "folders": [one.parts[-1] for one in folder.folders],
     }  # fmt: skip

@@ -264,3 +264,9 @@ def test_the_command_writes_a_site_and_says_where(published: Path, tmp_path: Pat
     assert done.stdout.startswith("site/index.html: 5 pages, ") or "site\\index.html" in done.stdout
     assert (tmp_path / "site" / "mine" / "index.html").is_file()
     assert done.stderr == ""
+
+
+def test_a_suite_of_this_package_is_introduced_by_what_it_is_for(whole_site: Path) -> None:
+    front = (whole_site / "index.html").read_text(encoding="utf-8")
+    assert "The paper&#39;s lattices and libraries, 50 noise-free samples" in front
+    assert "The published cases under three kernels" not in front
