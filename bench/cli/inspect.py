@@ -21,6 +21,8 @@ EPILOG = (
     '--terms "sin(u\\[n])" --out pendula.png'
 )
 PICTURES = (".png", ".svg", ".pdf")
+# Sensors and suspicions that are shown on the screen.
+SHOWN = 200
 
 
 def inspect(
@@ -99,8 +101,10 @@ def _show(found: Inspection, samples: Samples) -> None:
         say(f"  {line}", "dim")
     if not found.suspicious:
         say("Nothing suspicious.")
-    for line in found.suspicious:
+    for line in found.suspicious[:SHOWN]:
         say(f"Suspicious: {line}", "bold red")
+    if len(found.suspicious) > SHOWN:
+        say(f"{len(found.suspicious) - SHOWN} more are suspicious; --json has all")
     span = f"t = {found.begin:g} to {found.end:g} {time}".rstrip()
     every = f"every {found.interval:.4g} {time}".rstrip() + (", unevenly" if found.uneven else "")
     say(f"{found.sites} sites, {found.rows} rows{_also(found.seen)}; {span}, {every}")
@@ -113,10 +117,12 @@ def _show(found: Inspection, samples: Samples) -> None:
             str(site), one.name, str(one.readings), str(one.missing), f"{one.least:.4g}", f"{one.most:.4g}",
             "not seen" if one.noise != one.noise else f"{one.noise:.2g}", f"{one.step:.3g}" if one.step else "-",
         ]
-        for site, one in enumerate(found.sensors, 1)
+        for site, one in enumerate(found.sensors[:SHOWN], 1)
     ]  # fmt: skip
     inside = f" ({unit})" if unit else ""
     show_rows(["site", "column", "readings", "missing", f"least{inside}", f"most{inside}", "noise", "steps"], rows)
+    if len(found.sensors) > SHOWN:
+        say(f"{len(found.sensors) - SHOWN} more sensors; --json has all")
 
 
 def _also(seen: Sequence[str]) -> str:
