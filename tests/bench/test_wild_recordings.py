@@ -1,4 +1,4 @@
-"""Recordings of a shape that nobody expects: thousands of sites, times over forty decades; each is read soon, or told."""
+"""Recordings of a shape that nobody expects, of thousands of sites or times over decades: read soon, or told."""
 
 from __future__ import annotations
 
