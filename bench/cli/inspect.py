@@ -89,12 +89,13 @@ def _terms(system: str | None, terms: str | None) -> Library | None:
 def _show(found: Inspection, samples: Samples) -> None:
     """Print what a recording is like, the suspicious first."""
     from latticebench.bench.report.screen import console, show_rows
+    from latticebench.systems.errors import printable
 
     time, unit = samples.origin.time, samples.origin.unit
     screen = console()
 
     def say(text: str, style: str = "") -> None:
-        screen.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
+        screen.print(printable(text), style=style, highlight=False, markup=False, soft_wrap=True)
 
     say(found.source, "bold")
     for line in found.notes:

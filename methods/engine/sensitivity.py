@@ -303,11 +303,11 @@ class Stretches:
                 inside = begin + (step + 0.5 + INSIDE * (c[stage] - 0.5)) * h
                 f = None if self.inputs is None else self.inputs(inside)
                 rate, values, slopes = self.dynamics.linear(
-                    coefficients, t, at_y, f, curves and curves[stage], derivatives=z is not None, step=h
+                    coefficients, t, at_y, f, curves[stage] if curves else None, derivatives=z is not None, step=h
                 )
                 slopes_y[stage] = rate
                 if slopes_z is not None:
-                    at = basis and basis[stage]
+                    at = basis[stage] if basis else None
                     self._vary_rate(slopes_z[stage], at_z, values, slopes, at, chosen, by_terms=by_terms)
             y = y + h[:, None] * _combine(b, slopes_y)
             if z is not None:

@@ -46,3 +46,19 @@ def test_times_over_many_decades_are_inspected_and_refused_for_fits_with_the_rem
     assert "wide.csv: the longest of its steps in time is" in line
     assert "--set differentiation=FiniteDifference" in line
     assert "cut the recording there" in refused("diagnose", "wide.csv", *EQUATION, cwd=tmp_path)
+
+
+def test_a_label_or_a_column_that_steers_a_terminal_is_shown_as_what_it_is(tmp_path: Path) -> None:
+    path = written(tmp_path / "odd.csv", list("01234567"), 3)
+    steering = "\x1b[31m\u202e"
+    head, *rows = path.read_text().splitlines()
+    lines = [f"trajectory,{head.replace('u3', steering)}", *(f"{steering},{row}" for row in rows)]
+    path.write_text("\n".join(lines).replace("u1,u2", f"{steering}1,{steering}2"))
+    reading = ("odd.csv", "--columns", f"{steering}*")
+    for command in (
+        ("inspect", *reading), ("plot", *reading, "--out", "odd.png"),
+        ("fit", *reading, *FIT), ("diagnose", *reading, *EQUATION),
+    ):  # fmt: skip
+        code, out, err = soon(*command, cwd=tmp_path)
+        assert code in (0, 2)
+        assert not {"\x1b", "\u202e"} & {*out, *err}, command
