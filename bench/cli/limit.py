@@ -86,6 +86,8 @@ def limit(
         bound = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
+    elif layout != layout_of(None, None, "1", False):
+        raise InputError("--time, --columns, --scale and --sort say how files are read: give files, or leave them out")
     else:
         described.pop("set", None)
         case = case_of(

@@ -15,10 +15,11 @@ posix = pytest.mark.skipif(os.name != "posix", reason="closes streams as POSIX s
 needs_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is full")
 
 
-def in_shell(line: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+def in_shell(line: str, cwd: Path, encoding: str = "utf-8") -> subprocess.CompletedProcess[str]:
     """Run a line of shell, in which $LB is the program."""
     program = f"'{sys.executable}' -m latticebench"
-    return subprocess.run(["sh", "-c", line.replace("$LB", program)], cwd=cwd, capture_output=True, text=True)
+    command = ["sh", "-c", line.replace("$LB", program)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, encoding=encoding)
 
 
 @posix
@@ -41,6 +42,15 @@ def test_a_full_standard_error_ends_no_work_and_changes_no_exit_code(tmp_path: P
     assert long.returncode == 0
     assert "4 cases (4 ok)" in long.stdout
     assert in_shell("$LB fit nowhere.csv --system phi4 --library lib1 2>/dev/full", tmp_path).returncode == 2
+
+
+@posix
+def test_a_run_understands_itself_whatever_encoding_the_environment_asks_for(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SUITE)
+    done = in_shell("PYTHONIOENCODING=utf-16 $LB run s.toml --jobs 1 --results store 2>err", tmp_path, "utf-16")
+    assert "4 cases (4 ok)" in done.stdout
+    # What is left of a run that is killed ends by a process of its own, whose complaints would be here.
+    assert b"U\0n\0i\0c\0o\0d\0e\0E\0r\0r\0o\0r" not in (tmp_path / "err").read_bytes()
 
 
 @posix
