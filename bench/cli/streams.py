@@ -1,4 +1,4 @@
-"""Standard streams that are closed, or that cannot be written: nothing else is harmed by them."""
+"""What a program finds when it begins, standard streams and the environment: none of it harms anything else."""
 
 from __future__ import annotations
 
@@ -40,6 +40,14 @@ def settle() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def disarm() -> None:
+    """Take from the environment what packages of others end with a traceback for when they are imported."""
+    # Pictures are files; no window is ever opened.
+    os.environ["MPLBACKEND"] = "agg"
+    if not os.environ.get("SOURCE_DATE_EPOCH", "0").isdecimal():
+        del os.environ["SOURCE_DATE_EPOCH"]
 
 
 def lead_nowhere() -> None:
