@@ -17,7 +17,7 @@ class Guardian:
     def __enter__(self) -> Guardian:
         """Start it."""
         command = [sys.executable, "-c", START, search_path()]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
         return self
 
     def watch_over(self, worker: int, mark: str) -> None:
@@ -37,7 +37,8 @@ class Guardian:
         assert self.process.stdin is not None
         # Without it all goes on; it is needed only where the runner is killed.
         with suppress(OSError):
-            self.process.stdin.write(line + "\n")
+            # As bytes: the environment may ask for any encoding of texts.
+            self.process.stdin.write(line.encode() + b"\n")
             self.process.stdin.flush()
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, at: TracebackType | None) -> None:
@@ -58,8 +59,8 @@ def watch() -> None:
     from latticebench.bench.tree import end
 
     workers: dict[str, int] = {}
-    for line in sys.stdin:
-        *number, mark = line.split()
+    for line in sys.stdin.buffer:
+        *number, mark = line.decode().split()
         if number:
             workers[mark] = int(number[0])
         else:

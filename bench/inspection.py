@@ -132,6 +132,7 @@ def _suspicious(
 ) -> Iterator[str]:
     """Yield what deserves a look, one sentence each."""
     yield from _of_terms(samples, terms)
+    known: dict[bytes, str] = {}
     for site, one in enumerate(sensors):
         values = _values(samples.u[:, site])
         if one.readings == 0:
@@ -143,9 +144,9 @@ def _suspicious(
                 yield f"{one.name}: {count} readings of just {level:g} and none {end}; are they clipped?"
             if one.noise > 0 and one.step**2 / 12 > ROUNDED * one.noise**2:
                 yield f"{one.name}: readings come in steps of {one.step:.3g}; rounding makes most of the noise"
-        for other in range(site):
-            if one.readings and np.array_equal(samples.u[:, site], samples.u[:, other], equal_nan=True):
-                yield f"{one.name}: the same readings as {sensors[other].name}; is one a copy of the other?"
+        first = known.setdefault(_key(samples.u[:, site]), one.name)
+        if one.readings and first != one.name:
+            yield f"{one.name}: the same readings as {first}; is one a copy of the other?"
     yield from strays(samples)
     span, usual = float(np.ptp(samples.t)), float(np.median(np.diff(samples.t)))
     if len(peaks):
@@ -153,6 +154,11 @@ def _suspicious(
             yield f"{1 / max(peaks) / usual:.2g} readings in a period of the fastest line; {SPARSE:g} are few"
         if span * min(peaks) < SHORT:
             yield f"{span * min(peaks):.2g} periods of the slowest line; {SHORT:g} or more tell damping from noise"
+
+
+def _key(field: ndarray) -> bytes:
+    """Return the same for the same readings, where zero has no sign and missing ones are alike."""
+    return np.where(np.isnan(field), np.nan, field + 0.0).tobytes()
 
 
 def _of_terms(samples: Samples, terms: Library | None) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.files import shown
 
 COLUMNS = 'results.key, results.identity, kind, "case", status, reason, seed, origins.origin, content, history'
+# The seed and the history.
+OPTIONAL = (6, 9)
 
 
 def merge(folders: Sequence[Path], out: Path) -> tuple[int, int]:
@@ -76,8 +78,21 @@ def _together(values: Sequence[Any]) -> Any:
 
 def _plan(stores: Sequence[Store]) -> list[str]:
     """Return the keys of all cases in the order of the suite: that of the first store, then what only others have."""
-    keys = (key for store in stores for (key,) in store.read("SELECT key FROM suite ORDER BY place"))
+    keys = (key for store in stores for (key,) in _texts(store, "SELECT key FROM suite ORDER BY place"))
     return list(dict.fromkeys(keys))
+
+
+def _texts(store: Store, query: str, optional: Sequence[int] = ()) -> Iterator[tuple[Any, ...]]:
+    """Ask a store for rows of texts, but for the optional columns.
+
+    Raises:
+        InputError: something else is there: told of this store, before it is in the new one.
+    """
+    for row in store.read(query):
+        with store.sound():
+            if not all(isinstance(one, str) for number, one in enumerate(row) if number not in optional):
+                raise TypeError("what must be a text is none")
+        yield row
 
 
 def _rows(stores: Sequence[Store]) -> dict[str, tuple[Any, ...]]:
@@ -88,7 +103,7 @@ def _rows(stores: Sequence[Store]) -> dict[str, tuple[Any, ...]]:
         "ORDER BY place"
     )
     for store in stores:
-        for row in store.read(query):
+        for row in _texts(store, query, OPTIONAL):
             if row[0] not in found or (found[row[0]][4] != "ok" and row[4] == "ok"):
                 found[row[0]] = row
     return found

@@ -47,6 +47,8 @@ FINEST = 1e-6
 GAP = 2.0
 # In typical times between readings; each is some steps of the integrator.
 LONGEST_GAP = 1000.0
+# Times of the spectrum's grid, or four a reading if these are more.
+MOST_GRID = 2**20
 # Dry friction is viscous at first below this share of the usual speed: a fit that is far from the motion needs forces
 # without jumps.
 AT_REST = 0.1
@@ -70,14 +72,21 @@ class Spectrum:
 
     @classmethod
     def of(cls, samples: Samples) -> Spectrum:
-        """Return the spectrum of a recording; missing and uneven readings are interpolated."""
-        t = samples.t
-        step = float(np.median(np.diff(t)))
+        """Return the spectrum of a recording; missing and uneven readings are interpolated.
+
+        It is that of the most readings between gaps that no motion is followed through.
+        """
+        step = float(np.median(np.diff(samples.t)))
+        gaps = np.flatnonzero(np.diff(samples.t) > LONGEST_GAP * step) + 1
+        rows = max(np.split(np.arange(len(samples.t)), gaps), key=len)
+        t, u = samples.t[rows], samples.u[rows]
+        # Many shorter gaps, too, must not make a grid that no memory holds.
+        step = max(step, float(t[-1] - t[0]) / max(MOST_GRID, 4 * len(t)))
         grid = np.arange(t[0], t[-1] + step / 2, step)
         size = 4 * len(grid)
         omega = 2 * np.pi * np.fft.rfftfreq(size, step)
         total = np.zeros(len(omega))
-        for column in split_parts(samples.u, samples.is_complex).reshape(len(t), -1).T:
+        for column in split_parts(u, samples.is_complex).reshape(len(t), -1).T:
             seen = np.isfinite(column)
             if np.sum(seen) < 4:
                 continue

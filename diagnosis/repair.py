@@ -24,6 +24,7 @@ from latticebench.diagnosis.search import Search, Watcher
 from latticebench.diagnosis.unnamed import Left, without_name
 from latticebench.diagnosis.worth import lost
 from latticebench.methods.method import check_fit
+from latticebench.systems.arrays import free_memory
 from latticebench.systems.effects import Effect
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
@@ -40,6 +41,8 @@ SMALL, NAMELESS = "something small is left", "something without a name does bett
 NOT_REACHED = "the readings are not reached"
 # Readings beyond twice the number of unknowns that a diagnosis needs.
 SPARE = 10
+# Bytes for each row and pair of a state's numbers, at least: a fit has some two dozen derivatives by the start.
+MOTIONS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +159,7 @@ def diagnose(
     with threadpool_limits(1):
         problem = Problem.of(declared, order, shown, catalogue)
         _check_enough(problem)
+        _check_room(problem)
         search = Search(problem, watcher or (lambda _: None))
         found = None
 
@@ -200,6 +204,22 @@ def _check_enough(problem: Problem) -> None:
         raise InputError(
             f"{problem.data[0].source}: {count} readings are too few for {unknown} unknowns "
             "(the coefficients and each trajectory's start); give longer or more records"
+        )
+
+
+def _check_room(problem: Problem) -> None:
+    """Refuse chains whose derivatives alone take more memory than there is.
+
+    Raises:
+        InputError: there is too little.
+    """
+    size = problem.plain.size
+    needed, there = float(MOTIONS * size**2 * sum(len(one.t) for one in problem.data)), free_memory()
+    if needed > there:
+        raise InputError(
+            f"{problem.data[0].source}: a diagnosis of {problem.chain.sites} sites would take at least "
+            f"{needed / 2**30:.2g} GiB, and {there / 2**30:.2g} GiB may be used; give some of the sites, with "
+            "--columns or in a file of their own, or fewer rows"
         )
 
 

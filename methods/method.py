@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 
 from latticebench.methods.engine.bounds import checked
+from latticebench.systems.arrays import free_memory
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples, SimulatedSamples
@@ -349,7 +350,7 @@ def too_large(abilities: Abilities, data: Sequence[Samples], library: Library) -
     values = float(sum(sizes))
     if abilities.window and not library.uses("n"):
         values = max(size * min(abilities.window / one.sites, 1) for size, one in zip(sizes, data, strict=True))
-    needed, there = abilities.memory * values * len(library.terms), _free()
+    needed, there = abilities.memory * values * len(library.terms), free_memory()
     if needed <= there:
         return ""
     return (
@@ -357,16 +358,3 @@ def too_large(abilities: Abilities, data: Sequence[Samples], library: Library) -
         f"{there / 2**30:.2g} GiB may be used; show it fewer sites, samples or terms, or take a method that goes "
         "through them piece by piece, as least squares does"
     )
-
-
-def _free() -> float:
-    """Return the bytes that this process may still take: of its limit, if it has one, or of the machine."""
-    import psutil
-
-    free = float(psutil.virtual_memory().available)
-    try:
-        import resource
-    except ImportError:
-        return free
-    limit, _ = resource.getrlimit(resource.RLIMIT_DATA)
-    return free if limit == resource.RLIM_INFINITY else min(free, float(limit))

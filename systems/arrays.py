@@ -55,3 +55,16 @@ def pieces(count: int, size: int, most: int = PIECE) -> Iterator[slice]:
 def rows_of(array: ndarray) -> Iterator[slice]:
     """Yield the slices that go through the rows of a two-dimensional array."""
     return pieces(array.shape[0], array.shape[1])
+
+
+def free_memory() -> float:
+    """Return the bytes that this process may still take: of its limit, if it has one, or of the machine."""
+    import psutil
+
+    free = float(psutil.virtual_memory().available)
+    try:
+        import resource
+    except ImportError:
+        return free
+    limit, _ = resource.getrlimit(resource.RLIMIT_DATA)
+    return free if limit == resource.RLIM_INFINITY else min(free, float(limit))

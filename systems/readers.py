@@ -268,7 +268,7 @@ def _from_table(table: Table, source: str, ends: Ends, layout: Layout) -> list[S
     if len(table.body) == 0:
         raise InputError(f"{source}: it has 0 row(s) of data; a motion needs at least 2")
     body, origin = table.body, replace(choice.origin, notes=(*table.notes, *choice.origin.notes))
-    body, said = _with_seconds(body, choice.names["t"])
+    body, said = _with_seconds(body, choice.names["t"], source)
     if said:
         origin = replace(origin.noting(said), time="s")
     numbers = {new: _numbers(body, old, source) for new, old in choice.names.items() if new != "trajectory"}
@@ -291,28 +291,37 @@ def _from_table(table: Table, source: str, ends: Ends, layout: Layout) -> list[S
     return _trajectories(arrays, labels, _Told(source, ends, origin, choice.names["t"], sort=layout.sort))
 
 
-def _with_seconds(body: pandas.DataFrame, time: str) -> tuple[pandas.DataFrame, str]:
-    """Return a table whose times are numbers: dates and times of day become seconds after the first row."""
+def _with_seconds(body: pandas.DataFrame, time: str, source: str) -> tuple[pandas.DataFrame, str]:
+    """Return a table whose times are numbers: dates and times of day become seconds after the first row.
+
+    Raises:
+        InputError: the first one is such, another one is not.
+    """
     import pandas as pd
 
     given = body[time]
     if given.dtype.kind != "M":
-        first = str(given.iloc[0]).strip()
-        if not re.match(r"\d{4}-\d\d-\d\d|\d{1,2}:\d\d", first):
-            return body, ""
-        is_date = re.match(r"\d{4}-", first) is not None
-        texts = given.astype(str).str.strip().str.replace(",", ".", regex=False)
-        if is_date:
+        texts = given.astype("string").fillna("").str.strip().str.replace(",", ".", regex=False)
+        if re.match(r"\d{4}-\d\d-\d\d", texts.iloc[0], re.ASCII):
             given = pd.to_datetime(texts, format="ISO8601", errors="coerce", utc=True)
+            kind = "date from 1678 to 2261, written 2024-02-29 or 2024-02-29T13:45:00"
+        elif re.match(r"\d{1,2}:\d\d", texts.iloc[0], re.ASCII):
+            # pandas takes 0:99 and "2 days", too.
+            written = texts.where(texts.str.fullmatch(CLOCK, flags=re.ASCII))
+            given = pd.to_timedelta(written.str.replace(r"^(\d+:\d+)$", r"\1:00", regex=True), errors="coerce")
+            kind = "time of day, written 13:45 or 13:45:00.25"
         else:
-            given = pd.to_timedelta(texts.str.replace(r"^(\d+:\d+)$", r"\1:00", regex=True), errors="coerce")
-        if given.isna().any():
             return body, ""
+        if given.isna().any():
+            row = int(np.flatnonzero(given.isna())[0])
+            raise InputError(f"{source}: row {row + 1}, column {time}: {quoted(texts.iloc[row])} is no {kind}")
     since = (given - given.iloc[0]).dt.total_seconds()
     return body.assign(**{time: since}), f"times are seconds after the first row, {body[time].iloc[0]}"
 
 
-NUMBER = r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)|nan"
+# As in tables, hours may pass a day.
+CLOCK = r"\d{1,2}:[0-5]\d(:[0-5]\d(\.\d*)?)?"
+NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)|nan", re.ASCII | re.IGNORECASE)
 
 
 def _numbers(table: pandas.DataFrame, column: str, source: str) -> ndarray:
@@ -320,16 +329,17 @@ def _numbers(table: pandas.DataFrame, column: str, source: str) -> ndarray:
     given = table[column]
     if given.dtype.kind in "fiu":
         return given.to_numpy(dtype=float)
-    # Not by pandas, whose reader of numbers reads beyond the end of some damaged texts.
-    text = given.astype("string").str.strip()
-    wrong = given.notna() & ~text.str.fullmatch(NUMBER, flags=re.ASCII | re.IGNORECASE, na=False).astype(bool)
-    if wrong.any():
-        row = int(np.flatnonzero(wrong.to_numpy())[0])
-        raise InputError(
-            f"{source}: row {row + 1}, column {column}: {quoted(str(given.iloc[row]))} is not a number; "
-            "leave the cell empty if the value is missing"
-        )
-    return np.array([float(value) for value in text.where(given.notna(), "nan")])
+    # Not by pandas: its reader of numbers reads beyond the end of some damaged texts, and its other ways take a
+    # millisecond for a column of whatever length, of which there may be thousands.
+    missing = given.isna().to_numpy()
+    texts = ["nan" if gap else str(one).strip() for one, gap in zip(given.tolist(), missing.tolist(), strict=True)]
+    for row, text in enumerate(texts):
+        if not NUMBER.fullmatch(text):
+            raise InputError(
+                f"{source}: row {row + 1}, column {column}: {quoted(str(given.iloc[row]))} is not a number; "
+                "leave the cell empty if the value is missing"
+            )
+    return np.array([float(text) for text in texts])
 
 
 def _field(numbers: dict[str, ndarray], prefix: str, source: str) -> ndarray | None:

@@ -35,7 +35,7 @@ from latticebench.bench.cli import (
     status,
     table,
 )
-from latticebench.bench.cli.streams import lead_nowhere, settle
+from latticebench.bench.cli.streams import disarm, lead_nowhere, settle
 from latticebench.bench.threads import prefer_one_thread
 from latticebench.systems.errors import InputError, printable
 from latticebench.systems.files import LARGEST
@@ -101,6 +101,7 @@ app.command(epilog=schema.EPILOG)(schema.schema)
 def main() -> None:
     """Run the command line; bad input is one line on standard error and exit code 2."""
     settle()
+    disarm()
     prefer_one_thread()
     # What NumPy remarks on its way to a refusal is no help to anybody.
     warnings.filterwarnings("ignore", category=RuntimeWarning)

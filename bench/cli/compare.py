@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from latticebench.bench.cli.arguments import kept
 from latticebench.bench.cli.options import Beside, check_places, place
 from latticebench.systems.errors import InputError, printable, unknown
 from latticebench.systems.files import shown
@@ -109,6 +110,12 @@ def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path |
     files = () if out is None else _files(found, out)
     for path in files:
         check_places(read, out=path)
+    written: list[Path] = []
+    failures: list[str] = []
+    # Files first: the screen may be full, or its reader stop reading.
+    for path in files:
+        with kept(failures):
+            written.append(_write(found, path, about))
     if as_json:
         from latticebench.bench.report.document import provenance, to_json
         from latticebench.bench.report.outputs import against_document
@@ -116,8 +123,10 @@ def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path |
         print(to_json(against_document(found, provenance(), about.get("published", ""))), end="")
     else:
         _show(found)
-    for path in files:
-        print(shown(_write(found, path, about)), file=sys.stderr if as_json else sys.stdout)
+    for path in written:
+        print(shown(path), file=sys.stderr if as_json else sys.stdout)
+    if failures:
+        raise InputError("; ".join(failures))
 
 
 def _show(found: Contest) -> None:

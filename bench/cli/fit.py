@@ -119,21 +119,21 @@ def _report(
     from latticebench.systems.files import write_text
 
     units = units_of(data[0].origin)
-    if json_out != "-":
-        show_fit(found, quality, in_words(units))
-    if json_out is None and html_out is None:
-        return
-    overlay, about = of_fit(data, found), provenance([seed])
+    text = ""
     failures: list[str] = []
-    if json_out is not None:
+    # Files first: the screen may be full, or its reader stop reading.
+    if json_out is not None or html_out is not None:
+        overlay, about = of_fit(data, found), provenance([seed])
         text = to_json(fit_document(found, quality, units, about, overlay))
-        if json_out == "-":
-            print(text, end="")
-        else:
+        if json_out is not None and json_out != "-":
             with kept(failures):
                 write_text(Path(json_out), text)
-    if html_out is not None:
-        with kept(failures):
-            write_fit_page(found, overlay, quality, about, html_out)
+        if html_out is not None:
+            with kept(failures):
+                write_fit_page(found, overlay, quality, about, html_out)
+    if json_out == "-":
+        print(text, end="")
+    else:
+        show_fit(found, quality, in_words(units))
     if failures:
         raise InputError("; ".join(failures))

@@ -20,6 +20,8 @@ EPILOG = (
     '--terms "sin(u\\[n])" --out pendula.png'
 )
 PICTURES = (".png", ".svg", ".pdf")
+# Sensors and suspicions that are shown on the screen.
+SHOWN = 200
 
 
 def inspect(
@@ -90,19 +92,25 @@ def _show(found: Inspection, samples: Samples) -> None:
     """Print what a recording is like, the suspicious first."""
     from latticebench.bench.report.inspected import lines, sensors
     from latticebench.bench.report.screen import console, show_rows
+    from latticebench.systems.errors import printable
 
     screen = console()
 
     def say(text: str, style: str = "") -> None:
-        screen.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
+        screen.print(printable(text), style=style, highlight=False, markup=False, soft_wrap=True)
 
     say(found.source, "bold")
     for line in found.notes:
         say(f"  {line}", "dim")
     if not found.suspicious:
         say("Nothing suspicious.")
-    for line in found.suspicious:
+    for line in found.suspicious[:SHOWN]:
         say(f"Suspicious: {line}", "bold red")
+    if len(found.suspicious) > SHOWN:
+        say(f"{len(found.suspicious) - SHOWN} more are suspicious; --json has all")
     for line in lines(found, samples.origin.time):
         say(line)
-    show_rows(*sensors(found, samples.origin.unit))
+    heads, rows = sensors(found, samples.origin.unit)
+    show_rows(heads, rows[:SHOWN])
+    if len(rows) > SHOWN:
+        say(f"{len(rows) - SHOWN} more sensors; --json has all")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.arguments import asked, case_of, numbers
+from latticebench.bench.cli.arguments import asked, case_of, kept, numbers
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, Yes, check_places, complete_systems
 from latticebench.bench.cli.options import Library as LibraryName
 from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, layout_of, read_told
@@ -86,6 +86,8 @@ def limit(
         bound = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
+    elif layout != layout_of(None, None, "1", False):
+        raise InputError("--time, --columns, --scale and --sort say how files are read: give files, or leave them out")
     else:
         described.pop("set", None)
         case = case_of(
@@ -131,15 +133,20 @@ def _report(bound: BoundOf, target: float, json_out: str | None) -> None:
     with waiting("taking the bound"):
         found = bound.at(1, 1)
         needed = design(bound.at, target=target)
-    if json_out != "-":
-        show_limit(found, needed, bound.note, bound.warnings)
-    if json_out is None:
-        return
-    from latticebench.bench.report.document import provenance, to_json
-    from latticebench.bench.report.outputs import limit_document
+    text = ""
+    failures: list[str] = []
+    # The file first: the screen may be full, or its reader stop reading.
+    if json_out is not None:
+        from latticebench.bench.report.document import provenance, to_json
+        from latticebench.bench.report.outputs import limit_document
 
-    text = to_json(limit_document(found, needed, bound.note, provenance([1]), bound.warnings))
+        text = to_json(limit_document(found, needed, bound.note, provenance([1]), bound.warnings))
+        if json_out != "-":
+            with kept(failures):
+                write_text(Path(json_out), text)
     if json_out == "-":
         print(text, end="")
     else:
-        write_text(Path(json_out), text)
+        show_limit(found, needed, bound.note, bound.warnings)
+    if failures:
+        raise InputError("; ".join(failures))

@@ -1,4 +1,4 @@
-"""Standard streams that are closed, or that cannot be written: nothing else is harmed by them."""
+"""What a program finds when it begins, standard streams and the environment: none of it harms anything else."""
 
 from __future__ import annotations
 
@@ -34,12 +34,22 @@ def settle() -> None:
     sys.stdin = sys.stdin or os.fdopen(0, closefd=False)
     sys.stdout = sys.stdout or os.fdopen(1, "w", encoding="utf-8", closefd=False)
     sys.stderr = sys.stderr or os.fdopen(2, "w", encoding="utf-8", closefd=False)
-    if isinstance(sys.stderr, io.TextIOWrapper) and not sys.stderr.isatty():
+    # Whoever calls from Python may have put another stream there.
+    own = sys.stderr is sys.__stderr__
+    if own and isinstance(sys.stderr, io.TextIOWrapper) and not sys.stderr.isatty():
         below = io.BufferedWriter(_Dropping(2, "w", closefd=False))
         sys.stderr = io.TextIOWrapper(below, encoding=sys.stderr.encoding, line_buffering=True)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def disarm() -> None:
+    """Take from the environment what packages of others end with a traceback for when they are imported."""
+    # Pictures are files; no window is ever opened.
+    os.environ["MPLBACKEND"] = "agg"
+    if not os.environ.get("SOURCE_DATE_EPOCH", "0").isdecimal():
+        del os.environ["SOURCE_DATE_EPOCH"]
 
 
 def lead_nowhere() -> None:

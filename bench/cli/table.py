@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from latticebench.bench.cli.arguments import kept
 from latticebench.bench.cli.options import Beside, check_places, place
-from latticebench.systems.errors import unknown
+from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
@@ -49,13 +51,20 @@ def table(
     # Results of several kinds have folders of their own.
     for place_of_kind in () if out is None else (out, out / "fit"):
         check_places([None if published is None else published.file], out=place_of_kind / "cases.csv")
+    written: Sequence[Path] = ()
+    failures: list[str] = []
+    # Files first: the screen may be full, or its reader stop reading.
+    if out is not None:
+        with kept(failures):
+            written = kinds.publish(store, out, only, published)
     if as_json:
         print(document(store, beside=published), end="")
     else:
         kinds.show(store, value=value, beside=published)
-    if out is not None:
-        for path in kinds.publish(store, out, only, published):
-            print(shown(path), file=sys.stderr if as_json else sys.stdout)
+    for path in written:
+        print(shown(path), file=sys.stderr if as_json else sys.stdout)
+    if failures:
+        raise InputError("; ".join(failures))
 
 
 def document(store: Store, shard: Shard | None = None, beside: Published | None = None) -> str:

@@ -228,7 +228,15 @@ def _smoothing(x: ndarray, splines: BSplines, fields: Iterable[ndarray]) -> Call
     places = (middle[:, None] + half[:, None] * points).ravel()
     bend = splines.design(places, 4)
     penalty = bend.T @ (bend * (half[:, None] * weights).ravel()[:, None])
-    d, modes = scipy.linalg.eigh(penalty, gram)
+    try:
+        d, modes = scipy.linalg.eigh(penalty, gram)
+    # What NumPy and SciPy raise, the former where a number is not finite.
+    except ValueError:
+        steps = np.diff(x)
+        raise InputError(
+            f"the longest of its steps in time is {np.max(steps) / np.min(steps):.0e} times the shortest, too much for "
+            "a spline; cut the recording into trajectories, or use --set differentiation=FiniteDifference"
+        ) from None
     d = np.maximum(d, 0.0)
     power, outside = np.zeros(count), 0.0
     for field in fields:

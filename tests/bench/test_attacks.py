@@ -129,11 +129,30 @@ def survive_damage(made: Path, folder: Path, seeds: range) -> None:
         harm(store, draw)
         for command in (
             ["table", store, "--out", folder / "out"], ["table", store, "--json"],
-            ["figures", store, "--out", folder / "out"], ["compare", store, made / "store"],
+            ["figures", store, "--out", folder / "out"], ["compare", store, made / "store"], ["status", store],
+            ["merge", made / "store", store, "--out", folder / "merged"], ["publish", store, "--out", folder / "site"],
         ):  # fmt: skip
             code, _, err = soon(*command, cwd=folder)
             assert code in (0, 1, 2), (seed, command)
             assert code != 2 or (err.startswith("error: ") and err.count("\n") == 1), (seed, command, err)
+            # What is told is the store that is damaged, not one that is made of it.
+            assert ".merge-" not in err, (seed, command, err)
+            for made_of_it in ("merged", "site"):
+                shutil.rmtree(folder / made_of_it, ignore_errors=True)
+
+
+@posix
+def test_a_store_whose_plan_is_damaged_is_named_where_it_is_merged(made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made / "store", tmp_path / "broken")
+    with sqlite3.connect(tmp_path / "broken" / FILE) as connection:
+        connection.execute("CREATE TABLE other (place INTEGER PRIMARY KEY, key TEXT)")
+        connection.execute("INSERT INTO other SELECT place, NULL FROM suite")
+        connection.execute("DROP TABLE suite")
+        connection.execute("ALTER TABLE other RENAME TO suite")
+    connection.close()
+    line = refused("merge", made / "store", "broken", "--out", "merged", cwd=tmp_path)
+    assert line.startswith(f"error: {Path('broken', FILE)}: not a store of results that can be read")
+    assert not (tmp_path / "merged").exists()
 
 
 @posix

@@ -128,6 +128,7 @@ BAD_COMMANDS = {
     "limit --system phi4 --library lib2 --set D=2": "unknown parameter 'D'",
     "limit --system phi4 --library lib2 --initial knik": "did you mean 'kink'",
     "limit --system phi4 --terms u[n]": "outside the library",
+    "limit --system phi4 --library lib2 --columns x*": "--columns, --scale and --sort say how files are read",
     "limit phi4.csv --system phi4 --library lib2 --noise 0.1": "--noise: files are given",
     "limit phi4.csv --system phi4 --terms f[n]": "no measured input",
     "limit still.csv --terms u[n] --order 2": "still.csv: nothing moves",

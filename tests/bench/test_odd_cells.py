@@ -6,7 +6,7 @@ A warning of Python is an error here, as in all tests.
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -52,7 +52,8 @@ def spoil(rows: list[list[str]], draw: random.Random) -> None:
                 one[column] = one[draw.randrange(1, len(rows[0]))]
 
 
-def survive_cells(folder: Path, seeds: range, methods: tuple[str, ...]) -> None:
+def spoiled(folder: Path, seeds: Iterable[int]) -> Iterator[tuple[int, random.Random, str]]:
+    """Write the recording of each seed, and yield the seed, what else to draw from and the system."""
     for system in MODELS:
         succeed(
             "simulate", system, "--sites", 3, "--samples", 30, "--noise", 0.01, "--out", f"{system}.csv", cwd=folder
@@ -64,17 +65,32 @@ def survive_cells(folder: Path, seeds: range, methods: tuple[str, ...]) -> None:
         for _ in range(draw.choice((1, 1, 2, 4))):
             spoil(rows, draw)
         (folder / "odd.csv").write_text("".join(",".join(row) + "\n" for row in rows))
+        yield seed, draw, system
+
+
+def taken_or_refused(seed: int, command: tuple[object, ...], folder: Path) -> None:
+    """Run a command, which must end soon with its outputs or with one line and without them."""
+    code, _, err = soon(*command, cwd=folder)
+    told = (seed, command, err)
+    assert code in (0, 2), told
+    assert code == 0 or (err.startswith("error: ") and err.count("\n") == 1), told
+    assert " failed: " not in err, told
+    places = [folder / name for name in ("out", "page", "out.png") if name in command]
+    assert all(place.exists() == (code == 0) for place in places), told
+    for place in places:
+        place.unlink(missing_ok=True)
+
+
+def survive_cells(folder: Path, seeds: range, methods: tuple[str, ...]) -> None:
+    for seed, draw, system in spoiled(folder, seeds):
         fit = ("fit", "odd.csv", *MODELS[system], "--method", draw.choice(methods), "--json", "out", "--html", "page")
         for command in (fit, ("inspect", "odd.csv", "--out", "out.png"), ("plot", "odd.csv", "--out", "out.png")):
-            code, _, err = soon(*command, cwd=folder)
-            told = (seed, command, err)
-            assert code in (0, 2), told
-            assert code == 0 or (err.startswith("error: ") and err.count("\n") == 1), told
-            assert " failed: " not in err, told
-            places = [folder / name for name in ("out", "page", "out.png") if name in command]
-            assert all(place.exists() == (code == 0) for place in places), told
-            for place in places:
-                place.unlink(missing_ok=True)
+            taken_or_refused(seed, command, folder)
+
+
+def survive_diagnosis(folder: Path, seeds: range) -> None:
+    for seed, _, system in spoiled(folder, seeds):
+        taken_or_refused(seed, ("diagnose", "odd.csv", *MODELS[system], "--json", "out", "--html", "page"), folder)
 
 
 def test_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
@@ -84,3 +100,12 @@ def test_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Pa
 @pytest.mark.slow
 def test_many_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
     survive_cells(tmp_path, range(1000, 1150), ("least-squares", "stlsq", "weak", "sr3", "trajectory"))
+
+
+def test_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path) -> None:
+    survive_diagnosis(tmp_path, range(28, 32))
+
+
+@pytest.mark.slow
+def test_many_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path) -> None:
+    survive_diagnosis(tmp_path, range(2000, 2030))

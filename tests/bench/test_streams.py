@@ -15,10 +15,11 @@ posix = pytest.mark.skipif(os.name != "posix", reason="closes streams as POSIX s
 needs_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no device that is full")
 
 
-def in_shell(line: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+def in_shell(line: str, cwd: Path, encoding: str = "utf-8") -> subprocess.CompletedProcess[str]:
     """Run a line of shell, in which $LB is the program."""
     program = f"'{sys.executable}' -m latticebench"
-    return subprocess.run(["sh", "-c", line.replace("$LB", program)], cwd=cwd, capture_output=True, text=True)
+    command = ["sh", "-c", line.replace("$LB", program)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, encoding=encoding)
 
 
 @posix
@@ -41,6 +42,43 @@ def test_a_full_standard_error_ends_no_work_and_changes_no_exit_code(tmp_path: P
     assert long.returncode == 0
     assert "4 cases (4 ok)" in long.stdout
     assert in_shell("$LB fit nowhere.csv --system phi4 --library lib1 2>/dev/full", tmp_path).returncode == 2
+
+
+@posix
+@needs_full
+def test_a_full_screen_costs_no_file_that_was_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SUITE)
+    assert in_shell("$LB run s.toml --jobs 1 --results store", tmp_path).returncode == 0
+    assert in_shell("$LB simulate phi4 --sites 5 --samples 12 --out t.csv", tmp_path).returncode == 0
+    of_file = 't.csv --terms "u[n]; u[n]**3" --order 2 --json fit.json --html fit.html'
+    for line, places in (
+        (f"fit {of_file}", ("fit.json", "fit.html")),
+        ("limit --system phi4 --library lib1 --sites 5 --json limit.json", ("limit.json",)),
+        ("table store --out tables", ("tables/cases.csv", "tables/summary.md")),
+        ("compare store --against other --out against.csv", ("against.csv",)),
+    ):
+        done = in_shell(f"$LB {line} > /dev/full", tmp_path)
+        assert done.returncode == 2, done.stderr
+        assert "standard output cannot be written" in done.stderr
+        assert all((tmp_path / place).stat().st_size for place in places)
+
+
+@posix
+def test_what_the_environment_says_to_packages_of_others_ends_nothing(tmp_path: Path) -> None:
+    wrong = "MPLBACKEND=nonsense SOURCE_DATE_EPOCH=x"
+    done = in_shell(f"{wrong} $LB simulate phi4 --sites 5 --samples 12 --out t.csv", tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = in_shell(f'{wrong} $LB fit t.csv --terms "u[n]" --order 2 --html fit.html', tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@posix
+def test_a_run_understands_itself_whatever_encoding_the_environment_asks_for(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SUITE)
+    done = in_shell("PYTHONIOENCODING=utf-16 $LB run s.toml --jobs 1 --results store 2>err", tmp_path, "utf-16")
+    assert "4 cases (4 ok)" in done.stdout
+    # What is left of a run that is killed ends by a process of its own, whose complaints would be here.
+    assert b"U\0n\0i\0c\0o\0d\0e\0E\0r\0r\0o\0r" not in (tmp_path / "err").read_bytes()
 
 
 @posix

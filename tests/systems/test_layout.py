@@ -150,6 +150,20 @@ def test_dates_and_times_of_day_become_seconds(tmp_path, first, second):
     assert one.origin.time == "s"
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "kind"),
+    [
+        ("2026-02-28", "2026-02-30", "date"), ("2026-02-28", "x", "date"), ("2026-02-28", "", "date"),
+        ("2026-02-28", "0001-01-01", "date"), ("00:01", "2 days", "time of day"), ("00:01", "00:99", "time of day"),
+        ("00:01:02", "00:99:99.5", "time of day"), ("00:01", "", "time of day"),
+    ],
+)  # fmt: skip
+def test_what_is_no_time_among_dates_and_times_of_day_is_told_by_its_place(tmp_path, first, second, kind):
+    with pytest.raises(InputError) as caught:
+        read(written(tmp_path, f"t;u1\n{first};1\n{second};2\n{first};3\n"))
+    assert f"row 2, column t: {second!r} is no {kind}" in str(caught.value)
+
+
 def test_additional_columns_are_left_out_and_named(tmp_path):
     (one,) = read(written(tmp_path, "t,u1,speed\n0,1,x\n1,2,y\n"))
     assert one.origin.notes == ("not read: speed",)
