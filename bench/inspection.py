@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.noise import centred
-from latticebench.bench.report.notes import at_ends, strays
+from latticebench.bench.report.notes import at_ends, strays, turns
 from latticebench.diagnosis.instrument import of_readings, step_of
 from latticebench.diagnosis.problem import Spectrum
 from latticebench.methods.engine.dynamics import split_parts
@@ -148,6 +148,7 @@ def _suspicious(
         if one.readings and first != one.name:
             yield f"{one.name}: the same readings as {first}; is one a copy of the other?"
     yield from strays(samples)
+    yield from turns(samples)
     span, usual = float(np.ptp(samples.t)), float(np.median(np.diff(samples.t)))
     if len(peaks):
         if 1 / max(peaks) < SPARSE * usual:

@@ -23,6 +23,9 @@ ROUNDING = 0.01
 STRAY = 10.0
 # Readings at the very end of a range are clipped where there are so many, and so many times those at the next level.
 CLIPPED, CROWDED = 5, 4
+# A full turn in the units that angles are read in, and the share of one that an angle moves by from one reading to the
+# next at most.
+TURNS, STEADY = (2 * np.pi, 360.0), 0.3
 
 
 def at_ends(values: Float[ndarray, " values"]) -> Iterator[tuple[float, int, str]]:
@@ -59,6 +62,24 @@ def strays(samples: Samples) -> list[str]:
     return found
 
 
+def turns(samples: Samples) -> list[str]:
+    """Return which readings are of an angle that starts anew after a full turn."""
+    found = []
+    for site, column in enumerate(() if samples.is_complex else (samples.u / samples.origin.scale).T):
+        values = column[np.isfinite(column)]
+        jumps = np.abs(np.diff(values))
+        for turn in TURNS:
+            anew = np.abs(jumps - turn) < STEADY * turn
+            rest = float(np.max(np.abs(np.diff(np.unwrap(values, period=turn))), initial=0.0))
+            if np.any(anew) and np.ptp(values) <= turn and rest < STEADY * turn:
+                found.append(
+                    f"{samples.source}: u{site + 1} jumps by about {turn:.4g} at {np.sum(anew)} places and by no more "
+                    f"than {rest:.2g} elsewhere: an angle that starts anew after a full turn. Unwrap it first, as "
+                    "numpy.unwrap does."
+                )
+    return found
+
+
 def notes(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return what else a reader should know, one sentence or two each."""
     every = (_of_the_readings(diagnosis), _of_the_fits(diagnosis))
@@ -68,6 +89,7 @@ def notes(diagnosis: Diagnosis) -> tuple[str, ...]:
 def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
     for samples in diagnosis.data:
         yield from strays(samples)
+        yield from turns(samples)
         yield from _clipped(samples)
     yield from _steps(diagnosis)
     used, recorded = diagnosis.used

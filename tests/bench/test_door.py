@@ -167,3 +167,17 @@ def test_a_diagnosis_points_at_clipped_readings_and_holds_to_the_noise_once_they
     assert told == [True, False]
     assert found["empty"]["error"]["rms"]["after"] == pytest.approx(0.005, rel=0.1)
     assert [one["effect"] for one in found["empty"]["effects"]] == ["damping"]
+
+
+@pytest.mark.parametrize(("unit", "turn"), [("rad", 2 * np.pi), ("deg", 360.0)])
+def test_an_angle_that_starts_anew_after_a_full_turn_is_pointed_at_and_one_that_does_not_is_not(
+    typed: Typed, tmp_path: Path, unit: str, turn: float
+) -> None:
+    t = np.arange(0, 10, 0.05)
+    angle = turn * (0.6 * t - 0.02 * t**2 + 0.02 * np.sin(5 * t)) + 1e-3 * np.random.default_rng(1).normal(size=len(t))
+    for name, u in (("whole", angle), ("anew", angle % turn)):
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack([t, u]), "%.5f", ",", header=f"t,u1 ({unit})", comments="")
+    read = ["--columns", f"u1 ({unit})", "--scale", unit]
+    shown = {name: typed("inspect", f"{name}.csv", *read)[0] for name in ("whole", "anew")}
+    assert f"u1 jumps by about {turn:.4g} at 3 places" in " ".join(shown["anew"].split())
+    assert "starts anew" not in shown["whole"]
