@@ -22,7 +22,7 @@ from latticebench.pictures import Film, Picture
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
-from latticebench.systems.readers import from_frame, read_all
+from latticebench.systems.readers import from_frame, read_all, unwrapped
 from latticebench.systems.samples import Samples, check_alike
 from latticebench.systems.stencil import Ends
 
@@ -137,6 +137,7 @@ def read(
     columns: str | Sequence[str] = (),
     scale: str | float = 1.0,
     sort: bool = False,
+    turn: float = 0.0,
 ) -> Recording:
     """Read a recording.
 
@@ -148,6 +149,7 @@ def read(
             Dataset also the variable.
         scale: what one unit of a reading is in the equation: a number, or the unit of the readings such as "deg".
         sort: sort rows by their times, and average rows of the same time.
+        turn: for angles that start anew after a full turn: how much that is in the unit of the readings, such as 360.
 
     Raises:
         InputError: it cannot be read; the message says where, and what would read it.
@@ -169,15 +171,17 @@ def read(
         Recording(arrays: 1 site, 3 rows)
     """
     chosen = (columns,) if isinstance(columns, str) else tuple(columns)
-    layout = Layout(time, chosen, str(scale), sort)
+    layout = Layout(time, chosen, str(scale), sort, turn)
     if is_labelled(source):
         table, layout = as_table(source, layout)
         return Recording(tuple(from_frame(table, type(source).__name__, "unknown", layout)))
     if isinstance(source, pd.DataFrame):
         return Recording(tuple(from_frame(source, "table", "unknown", layout)))
     if isinstance(source, tuple) and len(source) == 2 and not isinstance(source[0], (str, Path)):
-        u = np.asarray(source[1]) * layout.factor
-        return Recording((Samples(np.asarray(source[0], float), u[:, None] if u.ndim == 1 else u, source="arrays"),))
+        u = np.asarray(source[1])
+        u = u[:, None] if u.ndim == 1 else u
+        u = unwrapped(u, layout.period, "arrays") if layout.period else u
+        return Recording((Samples(np.asarray(source[0], float), u * layout.factor, source="arrays"),))
     paths = [source] if isinstance(source, (str, Path)) else list(cast("Sequence[str | Path]", source))
     return Recording(tuple(read_all([Path(str(one)) for one in paths], "unknown", layout)))
 

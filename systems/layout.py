@@ -43,12 +43,26 @@ class Layout:
         scale: what one unit of a reading is in the equation: a number such as "1e-3", or the unit of the readings,
             such as "deg", which become radians. It holds for u and v.
         sort: put rows in the order of their times, and average rows of the same time.
+        turn: after how much, in the unit of the file, a reading of u starts anew, such as 360; such readings are
+            unwrapped. 0 where they go on.
     """
 
     time: str | None = None
     columns: tuple[str, ...] = ()
     scale: str = "1"
     sort: bool = False
+    turn: float = 0.0
+
+    @property
+    def period(self) -> float:
+        """After how much a reading starts anew; 0 where it goes on.
+
+        Raises:
+            InputError: it is not finite, or less than 0.
+        """
+        if not (math.isfinite(self.turn) and self.turn >= 0):
+            raise InputError(f"--turn {self.turn:g}: a full turn is a finite number above 0, such as 360")
+        return self.turn
 
     @property
     def factor(self) -> float:

@@ -142,6 +142,7 @@ class _Told:
     origin: Origin
     time: str = "t"
     sort: bool = False
+    turn: float = 0.0
 
 
 def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, told: _Told) -> list[Samples]:
@@ -167,9 +168,27 @@ def _samples(arrays: dict[str, ndarray | None], told: _Told) -> Samples:
     t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
     assert t is not None
     assert u is not None
+    if told.turn:
+        u = unwrapped(u, told.turn, told.source)
+        origin = origin.noting(f"readings that start anew after {told.turn:g} are unwrapped")
     if origin.scale != 1:
         u, v = u * origin.scale, None if v is None else v * origin.scale
     return Samples(t, u, v, f, None, told.source, told.ends, origin)
+
+
+def unwrapped(u: ndarray, turn: float, source: str) -> ndarray:
+    """Return readings (T, N) that go on where they started anew after a full turn.
+
+    Raises:
+        InputError: they are complex.
+    """
+    if np.iscomplexobj(u):
+        raise InputError(f"{source}: --turn is for angles; these readings are complex")
+    found = np.array(u, float)
+    for column in found.T:
+        seen = np.isfinite(column)
+        column[seen] = np.unwrap(column[seen], period=turn)
+    return found
 
 
 def _in_order(arrays: dict[str, ndarray | None], told: _Told) -> tuple[dict[str, ndarray | None], Origin]:
@@ -288,7 +307,7 @@ def _from_table(table: Table, source: str, ends: Ends, layout: Layout) -> list[S
         f = np.repeat(numbers["f"][:, None], u.shape[1], axis=1)
     labels = body[choice.names["trajectory"]].astype(str).to_numpy() if "trajectory" in choice.names else None
     arrays = {"t": numbers["t"], "u": u, "v": v, "f": f}
-    return _trajectories(arrays, labels, _Told(source, ends, origin, choice.names["t"], sort=layout.sort))
+    return _trajectories(arrays, labels, _Told(source, ends, origin, choice.names["t"], layout.sort, layout.period))
 
 
 def _with_seconds(body: pandas.DataFrame, time: str, source: str) -> tuple[pandas.DataFrame, str]:
@@ -442,7 +461,7 @@ def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends, layout: La
         raise InputError(f"{source}: array trajectory has shape {labels.shape}; it must be {t.shape}")
     becomes = UNITS[layout.unit][1] if layout.unit else ""
     origin = Origin(unit=layout.unit, scale=layout.factor, becomes=becomes)
-    told = _Told(source, ends, origin, sort=layout.sort)
+    told = _Told(source, ends, origin, sort=layout.sort, turn=layout.period)
     return _trajectories({"t": t.astype(float), "u": u, "v": v, "f": f}, labels, told)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from latticebench.bench.cli.options import JsonOut, SystemOption, Terms, check_places, place
-from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, layout_of
+from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, Turn, layout_of
 
 if TYPE_CHECKING:
     from latticebench.bench.inspection import Inspection
@@ -32,6 +32,7 @@ def inspect(
     columns: Columns = None,
     scale: Scale = "1",
     sort: Sort = False,
+    turn: Turn = 0.0,
     json_out: JsonOut = None,
     out: Annotated[
         Path | None,
@@ -55,7 +56,7 @@ def inspect(
     if out is not None and out.suffix.lower() not in PICTURES:
         raise unknown("ending", out.suffix, PICTURES, f"--out {out}")
     declared = _terms(system, terms)
-    data = read_all(files, "unknown", layout_of(time, columns, scale, sort))
+    data = read_all(files, "unknown", layout_of(time, columns, scale, sort, turn))
     found = [look(one, declared) for one in data]
     failures: list[str] = []
     if json_out is not None:

@@ -13,7 +13,7 @@ import typer
 from latticebench.bench.cli.arguments import asked, case_of, kept, numbers
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, Yes, check_places, complete_systems
 from latticebench.bench.cli.options import Library as LibraryName
-from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, layout_of, read_told
+from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, Turn, layout_of, read_told
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -64,6 +64,7 @@ def limit(
     columns: Columns = None,
     scale: Scale = "1",
     sort: Sort = False,
+    turn: Turn = 0.0,
     json_out: JsonOut = None,
     yes: Yes = False,
 ) -> None:
@@ -79,14 +80,14 @@ def limit(
         "trajectories": trajectories, "velocities": velocities, "initial": initial,
     }  # fmt: skip
     described = {name: value for name, value in simulated.items() if value is not None}
-    layout = layout_of(time, columns, scale, sort)
+    layout = layout_of(time, columns, scale, sort, turn)
     if files:
         for name in described:
             raise InputError(f"--{name}: files are given, whose samples are as they are; leave it out, or the files")
         bound = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
-    elif layout != layout_of(None, None, "1", False):
+    elif layout != layout_of(None, None, "1", False, 0.0):
         raise InputError("--time, --columns, --scale and --sort say how files are read: give files, or leave them out")
     else:
         described.pop("set", None)

@@ -50,17 +50,26 @@ Sort = Annotated[
     typer.Option("--sort", rich_help_panel=PANEL, help="Sort rows by their times, and average rows of the same time."),
 ]
 
+Turn = Annotated[
+    float,
+    typer.Option(
+        "--turn", metavar="NUMBER", rich_help_panel=PANEL,
+        help="For angles that start anew after a full turn: how much that is in the unit of the file, such as 360; "
+        "they are unwrapped.",
+    ),
+]  # fmt: skip
 
-def layout_of(time: str | None, columns: Sequence[str] | None, scale: str, sort: bool) -> Layout:
+
+def layout_of(time: str | None, columns: Sequence[str] | None, scale: str, sort: bool, turn: float) -> Layout:
     """Return the layout that the options describe.
 
     Raises:
-        InputError: the scale is neither a number nor a unit.
+        InputError: the scale is neither a number nor a unit, or the turn is none.
     """
     from latticebench.systems.layout import Layout
 
-    layout = Layout(time, tuple(columns or ()), scale, sort)
-    _ = layout.factor
+    layout = Layout(time, tuple(columns or ()), scale, sort, turn)
+    _ = layout.factor, layout.period
     return layout
 
 

@@ -74,8 +74,8 @@ def turns(samples: Samples) -> list[str]:
             if np.any(anew) and np.ptp(values) <= turn and rest < STEADY * turn:
                 found.append(
                     f"{samples.source}: u{site + 1} jumps by about {turn:.4g} at {np.sum(anew)} places and by no more "
-                    f"than {rest:.2g} elsewhere: an angle that starts anew after a full turn. Unwrap it first, as "
-                    "numpy.unwrap does."
+                    f"than {rest:.2g} elsewhere: an angle that starts anew after a full turn; --turn {turn:.16g} "
+                    "unwraps it."
                 )
     return found
 

@@ -181,3 +181,7 @@ def test_an_angle_that_starts_anew_after_a_full_turn_is_pointed_at_and_one_that_
     shown = {name: typed("inspect", f"{name}.csv", *read)[0] for name in ("whole", "anew")}
     assert f"u1 jumps by about {turn:.4g} at 3 places" in " ".join(shown["anew"].split())
     assert "starts anew" not in shown["whole"]
+    (remedy,) = re.findall(r"--turn (\S+)", shown["anew"])
+    went_on, told = typed("inspect", "anew.csv", *read, "--turn", remedy)
+    assert "starts anew" not in went_on
+    assert f"readings that start anew after {turn:g} are unwrapped" in " ".join(went_on.split()) + told

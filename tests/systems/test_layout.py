@@ -4,10 +4,12 @@ import numpy as np
 import openpyxl
 import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from latticebench.systems.errors import InputError
 from latticebench.systems.layout import Layout, unit_of
-from latticebench.systems.readers import from_frame, read, read_all
+from latticebench.systems.readers import from_frame, read, read_all, unwrapped
 
 PENDULA = Layout("time_s", ("theta_*_deg",), "deg")
 U = np.array([[10.5, -20.25], [11.0, np.nan], [-3.0, 4.0]])
@@ -210,3 +212,29 @@ def test_columns_are_not_chosen_in_an_archive_of_arrays(tmp_path):
         read(tmp_path / "a.npz", layout=PENDULA)
     (one,) = read(tmp_path / "a.npz", layout=Layout(scale="deg"))
     np.testing.assert_allclose(one.u, np.pi / 180)
+
+
+@given(start=st.floats(-1e3, 1e3), steps=st.lists(st.floats(-170, 170), min_size=4, max_size=40))
+def test_an_angle_that_starts_anew_goes_on_once_its_turn_is_told(start, steps):
+    angle = start + np.cumsum([0.0, *steps])
+    told = unwrapped(np.column_stack([angle % 360.0, -angle % 360.0]), 360.0, "file")
+    np.testing.assert_allclose(told - told[0], np.outer(angle - angle[0], [1, -1]), atol=1e-7)
+
+
+def test_a_turn_goes_on_across_readings_that_are_missing(tmp_path):
+    path = written(tmp_path, "t,u1,v1\n0,350,1\n1,,1\n2,10,1\n3,30,1\n")
+    (one,) = read(path, layout=Layout(scale="deg", turn=360.0))
+    np.testing.assert_allclose(np.rad2deg(one.u[:, 0]), [350, np.nan, 370, 390])
+    np.testing.assert_allclose(np.rad2deg(one.v), 1.0)
+    assert "readings that start anew after 360 are unwrapped" in one.origin.notes
+
+
+@pytest.mark.parametrize("turn", [np.nan, np.inf, -360.0])
+def test_a_turn_that_is_none_is_refused(turn):
+    with pytest.raises(InputError, match="--turn"):
+        _ = Layout(turn=turn).period
+
+
+def test_complex_readings_have_no_turn():
+    with pytest.raises(InputError, match="file: --turn is for angles"):
+        unwrapped(np.ones((3, 1)) * 1j, 360.0, "file")
