@@ -9,6 +9,7 @@ import numpy as np
 
 from latticebench.bench.report.units import with_unit
 from latticebench.diagnosis.instrument import step_of
+from latticebench.diagnosis.modes import MOST_MODES
 from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ ROUNDING = 0.01
 STRAY = 10.0
 # Readings at the very end of a range are clipped where there are so many, and so many times those at the next level.
 CLIPPED, CROWDED = 5, 4
+# A force of so many times the highest frequency of the chain moves its neighbours hardly more than noise does.
+HUM = 2.0
 # A full turn in the units that angles are read in, and the share of one that an angle moves by from one reading to the
 # next at most.
 TURNS, STEADY = (2 * np.pi, 360.0), 0.3
@@ -135,6 +138,21 @@ def _parts(field: np.ndarray) -> np.ndarray:
     return np.concatenate([field.real.ravel(), field.imag.ravel()]) if np.iscomplexobj(field) else field.ravel()
 
 
+def _hum(diagnosis: Diagnosis) -> Iterator[str]:
+    """Yield which forces are too fast for the chain to carry them on: only the site's own reading shows them."""
+    own = [one.frequency for one in diagnosis.modes[2]]
+    if not own or len(own) == MOST_MODES:
+        return
+    for found in diagnosis.findings:
+        frequency = found.placed.frequency or 0.0
+        free = all(force.text in ("1", "i*1") for force in found.placed.forces(diagnosis.after.chain))
+        if free and frequency > HUM * max(own) > 0:
+            yield (
+                f"The frequency of {found.name} is {frequency / max(own):.2g} times the highest of the chain's own: "
+                "hum that a sensor picks up would look the same. A recording at rest tells."
+            )
+
+
 def _of_the_fits(diagnosis: Diagnosis) -> Iterator[str]:
     for fitted, name in ((diagnosis.before, "declared equation"), (diagnosis.after, "last model")):
         if fitted.pieces > len(diagnosis.data) and (fitted is diagnosis.after or diagnosis.findings):
@@ -142,6 +160,7 @@ def _of_the_fits(diagnosis: Diagnosis) -> Iterator[str]:
                 f"The {name} is followed in {fitted.pieces} pieces of at most {fitted.longest} samples, each from a "
                 "start of its own: over longer ones it loses the readings."
             )
+    yield from _hum(diagnosis)
     if not diagnosis.after.converged:
         yield "The last fit's steps did not end: its numbers are less sure than their standard errors say."
     chain = diagnosis.after.chain

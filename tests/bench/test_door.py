@@ -185,3 +185,18 @@ def test_an_angle_that_starts_anew_after_a_full_turn_is_pointed_at_and_one_that_
     went_on, told = typed("inspect", "anew.csv", *read, "--turn", remedy)
     assert "starts anew" not in went_on
     assert f"readings that start anew after {turn:g} are unwrapped" in " ".join(went_on.split()) + told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("omega", "told"), [(14.0, True), (2.9, False)])
+def test_a_force_far_above_the_chains_own_frequencies_may_be_hum_and_the_report_says_so(
+    typed: Typed, tmp_path: Path, omega: float, told: bool
+) -> None:
+    t = np.arange(0, 60, 0.05)
+    swing = 0.5 * np.exp(-0.025 * t) * np.cos(2 * t) + 0.03 * np.cos(omega * t + 1)
+    table = np.column_stack([t, swing + 0.005 * np.random.default_rng(2).standard_normal(len(t))])
+    np.savetxt(tmp_path / "hum.csv", table, "%.5f", ",", header="t,u1", comments="")
+    words = ["--terms", "u[n]", "--order", "2", "--ends", "free", "--json", "-"]
+    found = json.loads(typed("diagnose", "hum.csv", *words)[0])
+    assert {one["effect"] for one in found["effects"]} == {"drive", "damping"}
+    assert any("hum that a sensor picks up" in line for line in found["notes"]) == told
