@@ -28,7 +28,7 @@ from latticebench.bench.case import STATUSES, Case
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import shown
 
-VERSION = 4
+VERSION = 5
 FILE = "results.sqlite"
 # In the head of the file, by which a store is known: "LtBn".
 APPLICATION = 0x4C74426E

@@ -94,5 +94,8 @@ def test_terms_with_a_conditioning_of_a_million_have_the_coefficients_of_the_who
     forms = [WeakForm(small, NEARLY_DEPENDENT, 2, most=most) for most in (FEW, 10**12)]
     found, expected = (sparse_estimate([form], select=None)[0] for form in forms)
     scaled = expected.regression.design / np.linalg.norm(expected.regression.design, axis=0)
-    assert 3e5 < np.linalg.cond(scaled) < 1e8
-    np.testing.assert_allclose(found.coefficients, expected.coefficients, rtol=1e-9)
+    conditioning = np.linalg.cond(scaled)
+    assert 3e5 < conditioning < 1e8
+    # Each kernel of a BLAS rounds otherwise: 6e-10 to 6e-9 were seen, where rounding alone gives 3e-10.
+    room = 100 * np.finfo(float).eps * conditioning
+    np.testing.assert_allclose(found.coefficients, expected.coefficients, rtol=room)
