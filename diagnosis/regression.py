@@ -92,6 +92,9 @@ def _carrying(problem: Problem, effects: Sequence[Placed] = ()) -> tuple[ndarray
     """Return what each number of a model would carry the smoothed states by, and by what they are carried.
 
     That is over a quarter of the shortest period, at each site less its mean: (rows, numbers) and (rows,).
+
+    Raises:
+        InputError: a declared term is not finite along the smoothed states.
     """
     from scipy.interpolate import make_interp_spline
 
@@ -105,19 +108,24 @@ def _carrying(problem: Problem, effects: Sequence[Placed] = ()) -> tuple[ndarray
         stretches, dynamics = record.stretches, assembled.dynamics
         f = None if stretches.inputs is None else stretches.inputs(record.times)
         driven = stretches.driven(record.times, splines)
-        values = dynamics.linear(assembled.coefficients, record.times, nodes, f, driven, derivatives=False)[1]
-        for term, sound in zip(problem.plain.terms, np.isfinite(values).all(axis=(0, 2, 3)), strict=False):
+        with np.errstate(all="ignore"):
+            values = dynamics.linear(assembled.coefficients, record.times, nodes, f, driven, derivatives=False)[1]
+        finite = np.isfinite(values).all(axis=(0, 2, 3))
+        for term, sound in zip(problem.plain.terms, finite, strict=False):
             if not sound:
                 raise InputError(f"the declared term {term.text} is infinite along the readings; check their unit")
-        values = np.einsum("tk,ptbm->bpkm", assembled.slope, values, optimize=True)
-        curve = make_interp_spline(record.times, values, k=min(3, len(record.times) - 1))
-        total = curve.antiderivative()(record.times)
+        # An effect's term that is infinite somewhere carries nothing, and so is not chosen.
+        values[:, ~finite] = 0.0
+        values = np.einsum("tk,ptbm->kbpm", assembled.slope, values, optimize=True)
         rate = nodes.reshape(len(nodes), dynamics.order, dynamics.parts, dynamics.count)[:, -1]
         # No window holds a gap.
         whole = record.times[window:] - record.times[:-window] < GAP * window * problem.step
-        flow = np.moveaxis(total[window:] - total[:-window], 2, -1)[whole]
-        flow = flow - np.mean(flow, axis=0)
-        designs.append(flow.reshape(-1, flow.shape[-1]))
+        designs.append(np.empty((int(np.sum(whole)) * rate[0].size, len(values))))
+        for column, value in enumerate(values):
+            curve = make_interp_spline(record.times, value, k=min(3, len(record.times) - 1))
+            total = curve.antiderivative()(record.times)
+            flow = (total[window:] - total[:-window])[whole]
+            designs[-1][:, column] = (flow - np.mean(flow, axis=0)).ravel()
         gone = (rate[window:] - rate[:-window])[whole]
         targets.append((gone - np.mean(gone, axis=0)).ravel())
     return np.concatenate(designs), np.concatenate(targets)

@@ -77,7 +77,10 @@ class Search:
         return self.worth.value(fitted)
 
     def horizons(self) -> Iterator[Found]:
-        """Yield what was found on each horizon, from short pieces to whole recordings."""
+        """Yield what was found on each horizon, from short pieces to whole recordings.
+
+        Where no model can be followed further, the last horizon comes again, with what acts at times of its own.
+        """
         done: tuple[Horizon, ...] = ()
         last: Found | None = None
         stuck = opened = False

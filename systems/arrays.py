@@ -67,4 +67,8 @@ def free_memory() -> float:
     except ImportError:
         return free
     limit, _ = resource.getrlimit(resource.RLIMIT_DATA)
-    return free if limit == resource.RLIM_INFINITY else min(free, float(limit))
+    if limit == resource.RLIM_INFINITY:
+        return free
+    # Only Linux tells what counts against this limit, and only there is it enforced.
+    taken = getattr(psutil.Process().memory_info(), "data", 0)
+    return max(0.0, min(free, float(limit - taken)))

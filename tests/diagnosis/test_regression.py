@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.regression import regressed, sustained
 from latticebench.diagnosis.repair import diagnose
-from latticebench.systems.effects import CATALOGUE
+from latticebench.systems.effects import CATALOGUE, Effect
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
 
@@ -55,6 +55,13 @@ def test_a_force_at_one_site_is_told_from_one_at_all():
 
 def test_of_a_chain_that_swings_by_itself_no_line_is_taken_for_a_forces():
     assert sustained(Problem.of(CHAIN, 2, [swinging((), sites=3)], CATALOGUE)) == []
+
+
+def test_a_force_of_the_users_that_is_infinite_somewhere_is_none_that_sustains_a_line():
+    driven = swinging(TONES[:1])
+    infinite = Effect("logarithm", "log(u[n])", acts="harmonic")
+    problem = Problem.of(SPRING, 2, [driven], (*CATALOGUE, infinite))
+    assert [one.effect.name for one in sustained(problem)[0].effects] == ["drive"]
 
 
 @pytest.mark.slow
