@@ -53,7 +53,7 @@ def diagnose(
     later: Sequence[Samples] = (),
     watcher: Watcher | None = None,
 ) -> tuple[Diagnosis, Report]:
-    """Find what a declared equation lacks, and what is to be said of it; Ctrl-C keeps what is known by then.
+    """Find what a declared equation lacks, and what is to be said of it; Ctrl-C keeps what earlier horizons have found.
 
     Args:
         data: recordings.
@@ -64,7 +64,8 @@ def diagnose(
         watcher: called with a text that says what is being done.
 
     Raises:
-        InputError: the equation cannot be set up on the recordings.
+        InputError: the equation cannot be set up on the recordings, or the file of effects is invalid.
+        KeyboardInterrupt: Ctrl-C, before the first horizon is done.
     """
     from latticebench.bench.report.content import content
     from latticebench.diagnosis import repair
@@ -95,6 +96,10 @@ def bound(data: Sequence[Samples], library: Library, order: int) -> BoundOf:
 @contextmanager
 def told(data: Sequence[Samples], method: str = "") -> Iterator[None]:
     """Turn whatever ends a computation into one line of text.
+
+    Args:
+        data: the recordings, whose first one the line names.
+        method: the one that fits them; empty for a diagnosis or a bound.
 
     Raises:
         InputError: it was skipped, or it failed.

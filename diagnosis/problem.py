@@ -47,7 +47,7 @@ FINEST = 1e-6
 GAP = 2.0
 # In typical times between readings; each is some steps of the integrator.
 LONGEST_GAP = 1000.0
-# Times of the spectrum's grid, or four a reading if these are more.
+# The spectrum's grid has at most so many times, or four for each reading if that is more.
 MOST_GRID = 2**20
 # Dry friction is viscous at first below this share of the usual speed: a fit that is far from the motion needs forces
 # without jumps.
@@ -74,7 +74,7 @@ class Spectrum:
     def of(cls, samples: Samples) -> Spectrum:
         """Return the spectrum of a recording; missing and uneven readings are interpolated.
 
-        It is that of the most readings between gaps that no motion is followed through.
+        Only the longest stretch without a gap of more than LONGEST_GAP usual steps counts.
         """
         step = float(np.median(np.diff(samples.t)))
         gaps = np.flatnonzero(np.diff(samples.t) > LONGEST_GAP * step) + 1

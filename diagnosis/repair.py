@@ -41,7 +41,7 @@ SMALL, NAMELESS = "something small is left", "something without a name does bett
 NOT_REACHED = "the readings are not reached"
 # Readings beyond twice the number of unknowns that a diagnosis needs.
 SPARE = 10
-# Bytes for each row and pair of a state's numbers, at least: a fit has some two dozen derivatives by the start.
+# Bytes for each row and each pair of numbers of a state, at least: a fit has some two dozen derivatives by the start.
 MOTIONS = 200
 
 

@@ -58,7 +58,7 @@ def rows_of(array: ndarray) -> Iterator[slice]:
 
 
 def free_memory() -> float:
-    """Return the bytes that this process may still take: of its limit, if it has one, or of the machine."""
+    """Return the bytes that this process may still take, by its own limit and by what the machine has."""
     import psutil
 
     free = float(psutil.virtual_memory().available)

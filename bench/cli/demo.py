@@ -57,3 +57,5 @@ def demo(
     )
     print(f"The whole story with pictures: {shown(page.resolve())} ({time.perf_counter() - began:.0f} s)")
     print(f"The same by hand: {command}")
+    if report.interrupted:
+        raise typer.Abort

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 # The library of a system that has the terms of its own equation.
 EQUATION = "equation"
-# Exit code of a program that Ctrl-C has ended.
-INTERRUPTED = 130
 
 EPILOG = (
     "Examples:  latticebench diagnose phi4.csv --system phi4 --html diagnosis.html\n\n"
@@ -85,7 +83,7 @@ def diagnose(
         found, report = calls.diagnose(data, declared, order, effects=effects, later=later, watcher=watcher)
     _report(found, report, json_out, html_out)
     if report.interrupted:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Abort
 
 
 def _declared(system: str | None, terms: str | None, order: int | None) -> tuple[System | None, Library, int]:

@@ -1,4 +1,4 @@
-"""What a program finds when it begins, standard streams and the environment: none of it harms anything else."""
+"""Standard streams and environment, made safe before a command begins."""
 
 from __future__ import annotations
 
@@ -45,10 +45,11 @@ def settle() -> None:
 
 
 def disarm() -> None:
-    """Take from the environment what packages of others end with a traceback for when they are imported."""
-    # Pictures are files; no window is ever opened.
+    """Keep environment variables from breaking other packages: no picture needs a window, and dates are in range."""
     os.environ["MPLBACKEND"] = "agg"
-    if not os.environ.get("SOURCE_DATE_EPOCH", "0").isdecimal():
+    # NumPy and Matplotlib make dates of these seconds, which years of five digits end with a traceback.
+    seconds = os.environ.get("SOURCE_DATE_EPOCH", "0")
+    if not (seconds.isdecimal() and len(seconds) <= 11):
         del os.environ["SOURCE_DATE_EPOCH"]
 
 

@@ -175,7 +175,7 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
     size = abs(units.scale)
     sensors = [f"{letter}{site + 1}" for letter in "uv"[: chain.levels] for site in range(chain.sites)]
     return Report(
-        verdict=cast(Verdict, diagnosis.verdict), sentence=_sentence(diagnosis, found),
+        verdict=cast(Verdict, diagnosis.verdict), sentence=_interrupted(found) if interrupted else _sentence(diagnosis, found),
         recording=_recording(diagnosis),
         declared=after, declared_before=before, declared_stderr=after_errors, declared_stderr_before=before_errors,
         declared_truth=None if diagnosis.truth is None else dict(zip(after, map(float, diagnosis.truth), strict=True)),
@@ -231,6 +231,12 @@ def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
             f"The model does not reach the readings: it leaves {two_digits(diagnosis.residual[1])} times their noise."
         )
     return " ".join(said)
+
+
+def _interrupted(found: tuple[AddedEffect, ...]) -> str:
+    """Return what was known when the search was stopped; what is missing, or left, was not known yet."""
+    names = _listed([one.effect for one in found]) if found else "nothing"
+    return f"Interrupted: this is what was known after the last horizon. Named by then: {names}."
 
 
 def _listed(names: Sequence[str], last: str = "and") -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +12,7 @@ import numpy as np
 from latticebench.bench.report.units import with_unit
 from latticebench.diagnosis.instrument import step_of
 from latticebench.diagnosis.modes import MOST_MODES
+from latticebench.systems.layout import UNITS
 from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
@@ -26,9 +29,9 @@ STRAY = 10.0
 CLIPPED, CROWDED = 5, 4
 # A force of so many times the highest frequency of the chain moves its neighbours hardly more than noise does.
 HUM = 2.0
-# A full turn in the units that angles are read in, and the share of one that an angle moves by from one reading to the
-# next at most.
-TURNS, STEADY = (2 * np.pi, 360.0), 0.3
+# A full turn where no unit is known, the share of one that an angle moves by from one reading to the next at most, and
+# how many times as far where it starts anew as elsewhere.
+TURNS, STEADY, LANDING = (2 * np.pi, 360.0), 0.3, 3.0
 
 
 def at_ends(values: Float[ndarray, " values"]) -> Iterator[tuple[float, int, str]]:
@@ -66,19 +69,26 @@ def strays(samples: Samples) -> list[str]:
 
 
 def turns(samples: Samples) -> list[str]:
-    """Return which readings are of an angle that starts anew after a full turn."""
-    found = []
-    for site, column in enumerate(() if samples.is_complex else (samples.u / samples.origin.scale).T):
-        values = column[np.isfinite(column)]
-        jumps = np.abs(np.diff(values))
-        for turn in TURNS:
-            anew = np.abs(jumps - turn) < STEADY * turn
-            rest = float(np.max(np.abs(np.diff(np.unwrap(values, period=turn))), initial=0.0))
-            if np.any(anew) and np.ptp(values) <= turn and rest < STEADY * turn:
+    """Return which readings look like an angle that starts anew after a full turn."""
+    found: list[str] = []
+    if samples.is_complex:
+        return found
+    origin = samples.origin
+    factor, becomes = UNITS.get(origin.unit, (1.0, origin.unit))
+    full = TURNS if not origin.unit else (2 * np.pi / factor,) if becomes == "rad" else ()
+    for site, column in enumerate((samples.u / origin.scale).T):
+        steps = np.diff(column)
+        steps = steps[np.isfinite(steps)]
+        for turn in full:
+            rest = np.abs(steps - turn * np.round(steps / turn))
+            anew = np.abs(steps) > turn / 2
+            # What jumps for another reason does not land where it would have been.
+            lands = np.max(rest[anew], initial=0.0) <= LANDING * np.max(rest[~anew], initial=0.0)
+            if np.any(anew) and lands and np.max(rest) < STEADY * turn and np.ptp(column[np.isfinite(column)]) <= turn:
                 found.append(
-                    f"{samples.source}: u{site + 1} jumps by about {turn:.4g} at {np.sum(anew)} places and by no more "
-                    f"than {rest:.2g} elsewhere: an angle that starts anew after a full turn; --turn {turn:.16g} "
-                    "unwraps it."
+                    f"{samples.source}: u{site + 1} jumps by about {turn:.4g} at {np.sum(anew)} places and moves by no "
+                    f"more than {np.max(rest):.2g} elsewhere. It looks like an angle that starts anew after a full "
+                    f"turn; --turn {turn:.16g} unwraps it."
                 )
     return found
 
@@ -90,7 +100,7 @@ def notes(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
-    for samples in diagnosis.data:
+    for samples in _joined(diagnosis.data):
         yield from strays(samples)
         yield from turns(samples)
         yield from _clipped(samples)
@@ -103,6 +113,21 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
         )
     if diagnosis.inputs:
         yield f"Between its samples the measured input was taken as {diagnosis.inputs}, which the readings suit best."
+
+
+def _joined(data: Sequence[Samples]) -> Iterator[Samples]:
+    """Yield each recording once: windows of one are put together, with a row without readings between them."""
+    for _, same in itertools.groupby(data, key=lambda one: one.source):
+        whole = next(same)
+        for part in same:
+            between = (whole.t[-1] + part.t[0]) / 2
+            both = {
+                name: np.concatenate([getattr(whole, name), np.full((1, whole.sites), np.nan), getattr(part, name)])
+                for name in ("u", "v")
+                if getattr(whole, name) is not None
+            }
+            whole = replace(whole, t=np.concatenate([whole.t, [between], part.t]), f=None, **both)
+        yield whole
 
 
 def _clipped(samples: Samples) -> Iterator[str]:
@@ -149,7 +174,7 @@ def _hum(diagnosis: Diagnosis) -> Iterator[str]:
         if free and frequency > HUM * max(own) > 0:
             yield (
                 f"The frequency of {found.name} is {frequency / max(own):.2g} times the highest of the chain's own: "
-                "hum that a sensor picks up would look the same. A recording at rest tells."
+                "hum that a sensor picks up would look the same. A recording of the chain at rest tells them apart."
             )
 
 

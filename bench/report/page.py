@@ -14,7 +14,6 @@ from latticebench.bench.report import pictures, rows
 from latticebench.bench.report.content import Report
 from latticebench.bench.report.curves import PictureCurves
 from latticebench.bench.report.document import Provenance
-from latticebench.bench.report.text import INTERRUPTED
 from latticebench.bench.report.units import in_words
 from latticebench.systems.files import write_text
 
@@ -49,7 +48,7 @@ def page(report: Report, curves: PictureCurves, about: Provenance | None = None)
         modes=rows.modes(report), horizons=rows.horizons(report), left=rows.left(report),
         instead=rows.instead(report), tried=_bars(report),
         alternatives=rows.alternatives(report),
-        units=in_words(report.recording.units), interrupted=INTERRUPTED, scale=_scale(report, curves.residual.limit),
+        units=in_words(report.recording.units), scale=_scale(report, curves.residual.limit),
         swing=1 < report.recording.sites < pictures.MAPPED,
         origin=[] if about is None else [line.partition(": ")[::2] for line in lines(about.model_dump())],
     )  # fmt: skip

@@ -7,13 +7,9 @@ from latticebench.bench.report.content import Report
 from latticebench.bench.report.screen import console, show_rows
 from latticebench.bench.report.units import in_words
 
-INTERRUPTED = "Interrupted: this is what was known after the last horizon."
-
 
 def show(report: Report) -> None:
     """Print a diagnosis."""
-    if report.interrupted:
-        _say(INTERRUPTED, "bold")
     _say(report.sentence, "bold")
     _say("\nNoise", "bold")
     for line in report.noise_lines:

@@ -269,7 +269,7 @@ def _heading(text: str) -> str:
 def _purpose(about: Mapping[str, str]) -> list[str]:
     """Return what a suite of this package is for, by the command that ran it; nothing of another."""
     name = about.get("suite", "")
-    if name not in names() or not about.get("command", "").startswith(f"latticebench run {name} "):
+    if name not in names() or not f"{about.get('command', '')} ".startswith(f"latticebench run {name} "):
         return []
     return [str(read_toml(file_of(name))["title"])]
 

@@ -58,8 +58,7 @@ def table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
             # Judged here, so that a run is judged by the rule as it stands.
             row["right"] = is_right(row["effect"], row["named"], row["alike"], row["verdict"])
         row["named"] = " + ".join(row["named"] or ())
-        # A trial of an earlier version did not say.
-        row["partly"] = "; ".join(row.get("partly") or ())
+        row["partly"] = "; ".join(row["partly"] or ())
         row["alike"] = "; ".join(", ".join(group) for group in row["alike"] or ())
         rows.append({name: row[name] for name in COLUMNS})
     frame = pd.DataFrame(rows, columns=list(COLUMNS))

@@ -235,7 +235,8 @@ def _smoothing(x: ndarray, splines: BSplines, fields: Iterable[ndarray]) -> Call
         steps = np.diff(x)
         raise InputError(
             f"the longest of its steps in time is {np.max(steps) / np.min(steps):.0e} times the shortest, too much for "
-            "a spline; cut the recording into trajectories, or use --set differentiation=FiniteDifference"
+            "a spline; cut the recording into trajectories, or fit it by --method stlsq --set "
+            "differentiation=FiniteDifference"
         ) from None
     d = np.maximum(d, 0.0)
     power, outside = np.zeros(count), 0.0

@@ -38,12 +38,19 @@ MIN_PIECE = 3
 
 
 def smooth(samples: Samples, order: int) -> tuple[Float[ndarray, "time sites"], Float[ndarray, "time sites"] | None]:
-    """Estimate u and, for order 2, v at all sample times by smoothing splines, with gaps bridged by cubics."""
+    """Estimate u and, for order 2, v at all sample times by smoothing splines, with gaps bridged by cubics.
+
+    Raises:
+        InputError: the times are too uneven for a spline.
+    """
     t = samples.t
-    u, slope = _filled(t, samples.u)
-    if order == 1:
-        return u, None
-    return u, (slope if samples.v is None else _filled(t, samples.v)[0])
+    try:
+        u, slope = _filled(t, samples.u)
+        if order == 1:
+            return u, None
+        return u, (slope if samples.v is None else _filled(t, samples.v)[0])
+    except InputError as error:
+        raise InputError(f"{samples.source}: {error}") from None
 
 
 def _filled(t: ndarray, field: ndarray) -> tuple[ndarray, ndarray]:

@@ -130,6 +130,23 @@ def test_what_is_known_when_it_is_interrupted_is_shown(
     assert json.loads(out)["interrupted"]
 
 
+def test_a_demo_that_is_interrupted_says_so_and_claims_nothing(
+    typed: Typed, known: repair.Diagnosis, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise repair.Interrupted(replace(known, findings=(), verdict="nothing missing"))
+
+    monkeypatch.setattr(repair, "diagnose", stopped)
+    code, out, _ = typed("demo", "--out", str(tmp_path / "demo"))
+    assert code == 130
+    assert "Named by then: nothing." in out
+    page = (tmp_path / "demo" / "diagnosis.html").read_text(encoding="utf-8")
+    for said in (out, page):
+        assert "Interrupted: " in said
+        assert "othing is missing" not in said
+        assert "nothing missing" not in said
+
+
 def test_json_to_the_screen_is_nothing_but_json_and_the_same_again(typed: Typed, plain: tuple[int, str, str]) -> None:
     assert typed("diagnose", "damped.csv", "--system", "phi4", "--json", "-") == plain
     assert json.loads(plain[1])["verdict"] == "explained"

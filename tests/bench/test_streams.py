@@ -64,8 +64,9 @@ def test_a_full_screen_costs_no_file_that_was_asked_for(tmp_path: Path) -> None:
 
 
 @posix
-def test_what_the_environment_says_to_packages_of_others_ends_nothing(tmp_path: Path) -> None:
-    wrong = "MPLBACKEND=nonsense SOURCE_DATE_EPOCH=x"
+@pytest.mark.parametrize("seconds", ["x", "99999999999999999", "9999999999999"])
+def test_what_the_environment_says_to_packages_of_others_ends_nothing(seconds: str, tmp_path: Path) -> None:
+    wrong = f"MPLBACKEND=nonsense SOURCE_DATE_EPOCH={seconds}"
     done = in_shell(f"{wrong} $LB simulate phi4 --sites 5 --samples 12 --out t.csv", tmp_path)
     assert done.returncode == 0, done.stderr
     done = in_shell(f'{wrong} $LB fit t.csv --terms "u[n]" --order 2 --html fit.html', tmp_path)

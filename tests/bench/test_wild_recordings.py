@@ -42,9 +42,10 @@ def test_times_over_many_decades_are_inspected_and_refused_for_fits_with_the_rem
     code, out, err = soon("inspect", "wide.csv", "--out", "wide.svg", cwd=tmp_path)
     assert (code, err) == (0, "")
     assert "unevenly" in out
-    line = refused("fit", "wide.csv", *FIT, cwd=tmp_path)
-    assert "wide.csv: the longest of its steps in time is" in line
-    assert "--set differentiation=FiniteDifference" in line
+    for method in ("stlsq", "trajectory"):
+        line = refused("fit", "wide.csv", *FIT, "--method", method, cwd=tmp_path)
+        assert "wide.csv: the longest of its steps in time is" in line
+        assert "--method stlsq --set differentiation=FiniteDifference" in line
     assert "cut the recording there" in refused("diagnose", "wide.csv", *EQUATION, cwd=tmp_path)
 
 

@@ -57,8 +57,7 @@ def _row(incomplete: Mapping[str, Any]) -> dict[str, Any]:
     case, made, truth = result["case"], result["recording"] or {}, result["truth"] or []
     row = {**case, **{name: result[name] for name in COLUMNS if name in result}, **made}
     row["asked"] = f"{case['instrument']} | {case['effects']}" + (f" | N={case['sites']}" if case["sites"] else "")
-    # A diagnosis of an earlier version did not say.
-    row["partly"] = "; ".join(result.get("partly") or ())
+    row["partly"] = "; ".join(result["partly"] or ())
     row.update(message=result["reason"] or None, count=None if result["truth"] is None else len(truth))
     row["truth"] = " + ".join(f"{one['name']} z={one['z']:.3g}" for one in truth)
     if result["status"] != "ok":

@@ -150,19 +150,6 @@ def test_a_run_of_all_kinds_has_the_published_form(conforms: Conforms) -> None:
     ]
 
 
-def test_a_diagnosis_of_an_earlier_version_has_no_word_of_why_it_is_partial() -> None:
-    trial, recording = Trial(system="phi4", effect="damping", z=10), Laboratory(seed=20_001)
-    found = {"named": ["damping"], "alike": [[]], "verdict": "partly explained", "apart": 0.0}
-    made = {"instrument": "coarse"}
-    told = {"recording": made, "truth": [], "verdict": "partly explained", "findings": []}
-    for table, old in (
-        (scores.table, row(trial, "ok", **found)),
-        (tables_of_laboratory.table, row(recording, "ok", **told)),
-    ):
-        del old["partly"]
-        assert list(table([old])["partly"]) == [""]
-
-
 def test_a_comparison_has_the_published_form(conforms: Conforms) -> None:
     old, new = ([fit(1, 0.1), fit(2, "inf"), fit(3, None, "failed")], [fit(1, 0.5), fit(2, 0.1)])
     judged = compare(*(of_fits(cases(results)) for results in (old, new)))

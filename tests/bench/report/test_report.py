@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +16,7 @@ from latticebench.bench.report import rows
 from latticebench.bench.report.content import content, diagnosis_document
 from latticebench.bench.report.document import Provenance, to_json
 from latticebench.bench.report.findings import added
-from latticebench.bench.report.notes import notes, strays
+from latticebench.bench.report.notes import notes, strays, turns
 from latticebench.bench.report.separation import separation
 from latticebench.bench.report.text import show
 from latticebench.bench.report.whereabouts import scaled_residuals, whereabouts
@@ -23,7 +25,7 @@ from latticebench.diagnosis.acting.everywhere import Everywhere
 from latticebench.diagnosis.noise import Noise
 from latticebench.diagnosis.repair import NAMELESS, NOT_REACHED, SMALL
 from latticebench.systems.effects import CATALOGUE, Effect, find
-from latticebench.systems.samples import Samples
+from latticebench.systems.samples import Origin, Samples
 
 Made = Callable[..., Any]
 
@@ -254,3 +256,33 @@ def test_a_reading_far_beyond_all_others_is_pointed_at() -> None:
     (text,) = strays(Samples(t, u, v, source="swing.csv"))
     assert text.startswith(f"swing.csv: u2 at t = {t[7]:g} is 1e+06")
     assert "empty" in text
+
+
+ANGLE = np.cumsum(np.full(400, 0.1)) + 0.02 * np.sin(np.arange(400))
+
+
+@pytest.mark.parametrize(
+    ("unit", "readings", "turn"),
+    [
+        ("", ANGLE % (2 * np.pi), "6.283185307179586"), ("", np.degrees(ANGLE) % 360, "360"),
+        ("deg", np.degrees(ANGLE) % 360, "360"), ("arcmin", np.degrees(60 * ANGLE) % 21600, "21600"),
+        # A square wave and a saw-tooth of about a turn, and what is said to be no angle.
+        ("", 2.5 * np.sign(np.sin(0.2 * np.arange(400))) + 0.02 * np.sin(np.arange(400)), ""),
+        ("", 0.05 * np.arange(400) % 5, ""), ("mm", np.degrees(ANGLE) % 360, ""), ("rad", np.degrees(ANGLE) % 360, ""),
+    ],
+)  # fmt: skip
+def test_what_jumps_by_a_full_turn_and_goes_on_from_there_looks_like_an_angle(
+    unit: str, readings: np.ndarray, turn: str
+) -> None:
+    samples = Samples(np.arange(400.0), readings[:, None], source="a.csv", origin=Origin(unit=unit))
+    remedies = [found for line in turns(samples) for found in re.findall(r"--turn (\S+)", line)]
+    assert remedies == ([turn] if turn else [])
+
+
+def test_windows_of_one_recording_are_pointed_at_once(pendula: Made) -> None:
+    t, u = np.arange(400.0), np.minimum(np.cos(0.1 * np.arange(400)), 0.8)[:, None]
+    whole = Samples(t, u, source="long.csv")
+    halves = tuple(replace(whole, t=t[rows], u=u[rows]) for rows in (slice(200), slice(200, None)))
+    told = [[line for line in notes(pendula(data=data)) if "are just" in line] for data in ((whole,), halves)]
+    assert len(told[0]) == 1
+    assert told[0] == told[1]
