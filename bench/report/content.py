@@ -175,8 +175,8 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
     size = abs(units.scale)
     sensors = [f"{letter}{site + 1}" for letter in "uv"[: chain.levels] for site in range(chain.sites)]
     return Report(
-        verdict=cast(Verdict, diagnosis.verdict), sentence=_interrupted(found) if interrupted else _sentence(diagnosis, found),
-        recording=_recording(diagnosis),
+        verdict=cast(Verdict, diagnosis.verdict),
+        sentence=_interrupted(found) if interrupted else _sentence(diagnosis, found), recording=_recording(diagnosis),
         declared=after, declared_before=before, declared_stderr=after_errors, declared_stderr_before=before_errors,
         declared_truth=None if diagnosis.truth is None else dict(zip(after, map(float, diagnosis.truth), strict=True)),
         noise=dict(zip(sensors, map(float, diagnosis.noise / size), strict=True)),

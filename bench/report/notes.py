@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -117,17 +116,19 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
 
 def _joined(data: Sequence[Samples]) -> Iterator[Samples]:
     """Yield each recording once: windows of one are put together, with a row without readings between them."""
-    for _, same in itertools.groupby(data, key=lambda one: one.source):
-        whole = next(same)
-        for part in same:
-            between = (whole.t[-1] + part.t[0]) / 2
-            both = {
-                name: np.concatenate([getattr(whole, name), np.full((1, whole.sites), np.nan), getattr(part, name)])
-                for name in ("u", "v")
-                if getattr(whole, name) is not None
-            }
-            whole = replace(whole, t=np.concatenate([whole.t, [between], part.t]), f=None, **both)
-        yield whole
+    for source in dict.fromkeys(one.source for one in data):
+        first, *others = [one for one in data if one.source == source]
+        for part in others:
+            between = (first.t[-1] + part.t[0]) / 2
+            v = None if first.v is None or part.v is None else _apart(first.v, part.v)
+            t = np.concatenate([first.t, [between], part.t])
+            first = replace(first, t=t, u=_apart(first.u, part.u), v=v, f=None)
+        yield first
+
+
+def _apart(field: ndarray, later: ndarray) -> ndarray:
+    """Return both with a row of NaN between them."""
+    return np.concatenate([field, np.full((1, field.shape[1]), np.nan), later])
 
 
 def _clipped(samples: Samples) -> Iterator[str]:
