@@ -319,6 +319,8 @@ def _with_seconds(body: pandas.DataFrame, time: str, source: str) -> tuple[panda
     import pandas as pd
 
     given = body[time]
+    if given.dtype.kind in "fiu":
+        return body, ""
     if given.dtype.kind != "M":
         texts = given.astype("string").fillna("").str.strip().str.replace(",", ".", regex=False)
         if re.match(r"\d{4}-\d\d-\d\d", texts.iloc[0], re.ASCII):
