@@ -23,7 +23,7 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
 from latticebench.systems.readers import from_frame, read_all, unwrapped
-from latticebench.systems.samples import Samples, check_alike
+from latticebench.systems.samples import Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
@@ -270,9 +270,14 @@ class Model:
         return library("terms", self.terms)
 
     def of(self, data: Recording) -> list[Samples]:
-        """Return recordings with the ends of this model."""
+        """Return recordings with the ends of this model.
+
+        Raises:
+            InputError: trajectories differ in their sites, columns or units.
+        """
         found = [replace(one, ends=self.ends) for one in data.samples]
         check_alike(found)
+        check_units(found)
         return found
 
     def __repr__(self) -> str:

@@ -24,7 +24,7 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.files import DATA, check_regular, reading, shown
 from latticebench.systems.folders import ZARR, files_in, partition, zarr_arrays
 from latticebench.systems.layout import UNITS, Layout, choose, quoted
-from latticebench.systems.samples import Origin, Samples, check_alike
+from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 from latticebench.systems.tables import Table, check_count, named_once, read_csv, read_sheet
 
@@ -77,14 +77,7 @@ def read_all(paths: Sequence[Path], ends: Ends = "unknown", layout: Layout = PLA
     """
     data = [samples for path in paths for samples in read(path, ends, layout)]
     check_alike(data)
-    for one in data[1:]:
-        for name in ("time", "unit"):
-            units = [getattr(samples.origin, name) or "no unit" for samples in (one, data[0])]
-            if units[0] != units[1]:
-                raise InputError(
-                    f"{one.source}: {'times' if name == 'time' else 'readings'} in {units[0]}, those of "
-                    f"{data[0].source} in {units[1]}; read them apart, or bring them to one unit"
-                )
+    check_units(data)
     return data
 
 

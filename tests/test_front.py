@@ -231,6 +231,24 @@ def test_a_diagnosis_takes_effects_of_ones_own_and_forecasts_another_recording(t
         lb.diagnose(first, PENDULUM, holdout=lb.read((t, np.stack([np.cos(t), np.sin(t)], axis=1))))
 
 
+@pytest.mark.parametrize(
+    ("first", "later", "words"),
+    [
+        (("t [s]", "x [deg]", "deg"), ("t [ms]", "x [deg]", "deg"), "times in ms, those of table in s"),
+        (("t [s]", "x [mm]", 1), ("t [s]", "x [cm]", 1), "readings in cm, those of table in mm"),
+        (("t [s]", "x [deg]", "deg"), ("t [s]", "x [deg]", 1), "scaled readings in deg, those of table in rad"),
+    ],
+)
+def test_a_recording_in_other_units_is_no_holdout(first, later, words):
+    t = np.arange(0, 12, 0.1)
+    found = []
+    for time, column, scale in (first, later):
+        frame = pd.DataFrame({time: t, column: 3 * np.cos(2 * t) + 0.1 * np.sin(97 * t)})
+        found.append(lb.read(frame, time=time, columns=column, scale=scale))
+    with pytest.raises(InputError, match=f"table: {words}; read them apart"):
+        lb.diagnose(found[0], PENDULUM, holdout=found[1])
+
+
 def test_an_interrupted_diagnosis_returns_what_it_knows():
     def stop(text):
         if "without" in text or "no name" in text:
