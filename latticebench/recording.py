@@ -22,7 +22,8 @@ from latticebench.pictures import Film, Picture
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
-from latticebench.systems.readers import from_frame, read_all, unwrapped
+from latticebench.systems.ordering import unwrapped
+from latticebench.systems.readers import from_frame, read_all
 from latticebench.systems.samples import Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 

@@ -24,6 +24,7 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.files import DATA, check_regular, reading, shown
 from latticebench.systems.folders import ZARR, files_in, partition, zarr_arrays
 from latticebench.systems.layout import UNITS, Layout, choose, quoted
+from latticebench.systems.ordering import averaged, in_order, unwrapped
 from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 from latticebench.systems.tables import Table, check_count, named_once, read_csv, read_sheet
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     import pandas
     import pyarrow
     from numpy import ndarray
+
+    from latticebench.systems.ordering import Arrays
 
 # What is written and read, and what is only read.
 FORMATS = (".csv", ".npz", ".parquet")
@@ -138,7 +141,7 @@ class _Told:
     turn: float = 0.0
 
 
-def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, told: _Told) -> list[Samples]:
+def _trajectories(arrays: Arrays, labels: ndarray | None, told: _Told) -> list[Samples]:
     """Return the samples of arrays t, u, v and f, one trajectory per label in order of first appearance."""
     if labels is None:
         return [_samples(arrays, told)]
@@ -155,71 +158,24 @@ def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, tol
     return found
 
 
-def _samples(arrays: dict[str, ndarray | None], told: _Told) -> Samples:
+def _samples(arrays: Arrays, told: _Told) -> Samples:
     """Return one trajectory, in the units of the equation."""
-    arrays, origin = _in_order(arrays, told)
+    arrays, notes = in_order(arrays, told.source, told.time, sort=told.sort)
+    origin = told.origin.noting(*notes)
+    if told.turn:
+        assert arrays["u"] is not None
+        # Before rows of the same time are averaged: halfway from 359 to 1 is 360, not 180.
+        arrays = {**arrays, "u": unwrapped(arrays["u"], told.turn, told.source)}
+        origin = origin.noting(f"readings that start anew after {told.turn:g} are unwrapped")
+    if told.sort:
+        arrays, notes = averaged(arrays)
+        origin = origin.noting(*notes)
     t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
     assert t is not None
     assert u is not None
-    if told.turn:
-        u = unwrapped(u, told.turn, told.source)
-        origin = origin.noting(f"readings that start anew after {told.turn:g} are unwrapped")
     if origin.scale != 1:
         u, v = u * origin.scale, None if v is None else v * origin.scale
     return Samples(t, u, v, f, None, told.source, told.ends, origin)
-
-
-def unwrapped(u: ndarray, turn: float, source: str) -> ndarray:
-    """Return readings (T, N) that go on where they started anew after a full turn.
-
-    Raises:
-        InputError: they are complex.
-    """
-    if np.iscomplexobj(u):
-        raise InputError(f"{source}: --turn is for angles; these readings are complex")
-    found = np.array(u, float)
-    for column in found.T:
-        seen = np.isfinite(column)
-        column[seen] = np.unwrap(column[seen], period=turn)
-    return found
-
-
-def _in_order(arrays: dict[str, ndarray | None], told: _Told) -> tuple[dict[str, ndarray | None], Origin]:
-    """Return arrays whose times increase.
-
-    Raises:
-        InputError: they do not, and were not to be sorted.
-    """
-    t = arrays["t"]
-    assert t is not None
-    steps = np.diff(t)
-    if not np.all(np.isfinite(t)) or np.all(steps > 0):
-        return arrays, told.origin
-    if not told.sort:
-        row = int(np.flatnonzero(steps <= 0)[0]) + 1
-        remedy = "--sort averages rows of the same time" if t[row] == t[row - 1] else "--sort puts the rows in order"
-        raise InputError(
-            f"{told.source}: row {row + 1}, column {told.time}: time {t[row]:g} after {t[row - 1]:g}; times must "
-            f"increase: {remedy}; several trajectories need a column 'trajectory'"
-        )
-    times, group = np.unique(t, return_inverse=True)
-    order = np.argsort(group, kind="stable")
-    begins = np.flatnonzero(np.diff(group[order], prepend=-1))
-    found: dict[str, ndarray | None] = {"t": times}
-    for name in ("u", "v", "f"):
-        array = arrays[name]
-        if array is None:
-            found[name] = None
-            continue
-        seen = ~np.isnan(array[order])
-        total = np.add.reduceat(np.where(seen, array[order], 0), begins)
-        with np.errstate(invalid="ignore"):
-            found[name] = total / np.add.reduceat(seen, begins, dtype=float)
-    early = np.count_nonzero(steps < 0)
-    notes = [f"{early} row(s) came too late; all are put in the order of their times"] if early else []
-    if len(times) < len(t):
-        notes.append(f"{len(t) - len(times)} row(s) have the time of another one; such rows are averaged")
-    return found, told.origin.noting(*notes)
 
 
 # CSV and Parquet

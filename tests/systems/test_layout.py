@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from commandline import no_longer_than
 from latticebench.systems.errors import InputError
 from latticebench.systems.layout import Layout, unit_of
-from latticebench.systems.readers import from_frame, read, read_all, unwrapped
+from latticebench.systems.ordering import unwrapped
+from latticebench.systems.readers import from_frame, read, read_all
 
 PENDULA = Layout("time_s", ("theta_*_deg",), "deg")
 U = np.array([[10.5, -20.25], [11.0, np.nan], [-3.0, 4.0]])
@@ -236,6 +237,28 @@ def test_a_turn_goes_on_across_readings_that_are_missing(tmp_path):
     np.testing.assert_allclose(np.rad2deg(one.u[:, 0]), [350, np.nan, 370, 390])
     np.testing.assert_allclose(np.rad2deg(one.v), 1.0)
     assert "readings that start anew after 360 are unwrapped" in one.origin.notes
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        "0,350,4\n1,359,1\n1,1,2\n2,10,1\n",
+        "2,10,1\n1,359,1\n0,350,4\n1,1,2\n",
+        "0,350,4\n1,359,1\n1,1,2\n1,,\n2,,\n2,10,1\n",
+    ],
+)
+def test_an_angle_goes_on_before_readings_of_the_same_time_are_averaged(tmp_path, rows):
+    path = written(tmp_path, f"t,u1,v1\n{rows}")
+    (one,) = read(path, layout=Layout(sort=True, turn=360.0))
+    np.testing.assert_array_equal(one.t, [0, 1, 2])
+    np.testing.assert_allclose(one.u[:, 0], [350, 360, 370])
+    np.testing.assert_allclose(one.v[:, 0], [4, 1.5, 1])
+
+
+def test_a_time_that_is_missing_is_told_by_its_row_where_rows_are_sorted(tmp_path):
+    path = written(tmp_path, "t,u1\n0,1\n0,2\n,3\n1,4\n")
+    with pytest.raises(InputError, match="row 3, column t: the time is missing"):
+        read(path, layout=Layout(sort=True))
 
 
 @pytest.mark.parametrize("turn", [np.nan, np.inf, -360.0])
