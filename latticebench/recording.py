@@ -150,7 +150,8 @@ def read(
             Dataset also the variable.
         scale: what one unit of a reading is in the equation: a number, or the unit of the readings such as "deg".
         sort: sort rows by their times, and average rows of the same time.
-        turn: for angles that start anew after a full turn: how much that is in the unit of the readings, such as 360.
+        turn: unwrap angles that jump back after a full turn. It is a full turn in the unit of the file, such as 360;
+            neighbouring readings must be less than half of it apart. 0 leaves u as it is. v is never changed.
 
     Raises:
         InputError: it cannot be read; the message says where, and what would read it.

@@ -166,7 +166,8 @@ def _samples(arrays: Arrays, told: _Told) -> Samples:
         assert arrays["u"] is not None
         # Before rows of the same time are averaged: halfway from 359 to 1 is 360, not 180.
         arrays = {**arrays, "u": unwrapped(arrays["u"], told.turn, told.source)}
-        origin = origin.noting(f"readings that start anew after {told.turn:g} are unwrapped")
+        unit = f" {origin.unit}" if origin.unit else ""
+        origin = origin.noting(f"angles are unwrapped (a full turn is {told.turn:g}{unit})")
     if told.sort:
         arrays, notes = averaged(arrays)
         origin = origin.noting(*notes)

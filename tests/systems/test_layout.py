@@ -231,12 +231,18 @@ def test_an_angle_that_starts_anew_goes_on_once_its_turn_is_told(start, steps):
     np.testing.assert_allclose(told - told[0], np.outer(angle - angle[0], [1, -1]), atol=1e-7)
 
 
+@pytest.mark.parametrize(("head", "unit"), [("u1", ""), ("u1 [deg]", " deg")])
+def test_angles_that_are_unwrapped_are_told_with_their_turn_in_the_unit_of_the_file(tmp_path, head, unit):
+    path = written(tmp_path, f"t,{head}\n0,350\n1,10\n")
+    (one,) = read(path, layout=Layout(columns=(head,), turn=360.0))
+    assert f"angles are unwrapped (a full turn is 360{unit})" in one.origin.notes
+
+
 def test_a_turn_goes_on_across_readings_that_are_missing(tmp_path):
     path = written(tmp_path, "t,u1,v1\n0,350,1\n1,,1\n2,10,1\n3,30,1\n")
     (one,) = read(path, layout=Layout(scale="deg", turn=360.0))
     np.testing.assert_allclose(np.rad2deg(one.u[:, 0]), [350, np.nan, 370, 390])
     np.testing.assert_allclose(np.rad2deg(one.v), 1.0)
-    assert "readings that start anew after 360 are unwrapped" in one.origin.notes
 
 
 @pytest.mark.parametrize(
@@ -263,7 +269,7 @@ def test_a_time_that_is_missing_is_told_by_its_row_where_rows_are_sorted(tmp_pat
 
 @pytest.mark.parametrize("turn", [np.nan, np.inf, -360.0])
 def test_a_turn_that_is_none_is_refused(turn):
-    with pytest.raises(InputError, match="--turn"):
+    with pytest.raises(InputError, match=r"--turn .*in the unit of the file"):
         _ = Layout(turn=turn).period
 
 
