@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-import numpy as np
 import pandas as pd
 
 from latticebench import systems
@@ -22,8 +21,7 @@ from latticebench.pictures import Film, Picture
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
-from latticebench.systems.ordering import unwrapped
-from latticebench.systems.readers import from_frame, read_all
+from latticebench.systems.readers import from_arrays, from_frame, read_all
 from latticebench.systems.samples import Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 
@@ -180,10 +178,8 @@ def read(
     if isinstance(source, pd.DataFrame):
         return Recording(tuple(from_frame(source, "table", "unknown", layout)))
     if isinstance(source, tuple) and len(source) == 2 and not isinstance(source[0], (str, Path)):
-        u = np.asarray(source[1])
-        u = u[:, None] if u.ndim == 1 else u
-        u = unwrapped(u, layout.period, "arrays") if layout.period else u
-        return Recording((Samples(np.asarray(source[0], float), u * layout.factor, source="arrays"),))
+        t, u = cast("tuple[ArrayLike, ArrayLike]", source)
+        return Recording(tuple(from_arrays(t, u, "arrays", "unknown", layout)))
     paths = [source] if isinstance(source, (str, Path)) else list(cast("Sequence[str | Path]", source))
     return Recording(tuple(read_all([Path(str(one)) for one in paths], "unknown", layout)))
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     import pandas
     import pyarrow
     from numpy import ndarray
+    from numpy.typing import ArrayLike
 
     from latticebench.systems.ordering import Arrays
 
@@ -63,7 +64,7 @@ def read(path: Path, ends: Ends = "unknown", layout: Layout = PLAIN) -> list[Sam
     source = shown(path)
     match path.suffix.lower():
         case ".npz":
-            return _from_arrays(_read_npz(path, layout), source, ends, layout)
+            return _from_arrays(_read_npz(path), source, ends, layout)
         case ".parquet":
             return _from_table(_read_parquet(path, layout), source, ends, layout)
         case ".xlsx":
@@ -87,8 +88,6 @@ def read_all(paths: Sequence[Path], ends: Ends = "unknown", layout: Layout = PLA
 def _from_folder(folder: Path, ends: Ends, layout: Layout) -> list[Samples]:
     """Return the trajectories of a Zarr store, of a Parquet table in parts, or of all files in a folder."""
     if folder.suffix.lower() == ZARR:
-        if layout.time is not None or layout.columns:
-            raise InputError(f"{shown(folder)}: it has arrays t and u, no columns; leave --time and --columns out")
         arrays = zarr_arrays(folder, ARRAYS)
         _check_names(list(arrays), shown(folder))
         return _from_arrays(arrays, shown(folder), ends, layout)
@@ -329,10 +328,8 @@ def _field(numbers: dict[str, ndarray], prefix: str, source: str) -> ndarray | N
 # NPZ
 
 
-def _read_npz(path: Path, layout: Layout) -> dict[str, ndarray]:
+def _read_npz(path: Path) -> dict[str, ndarray]:
     """Return the arrays, whose names, types and sizes are looked at before they are unpacked."""
-    if layout.time is not None or layout.columns:
-        raise InputError(f"{shown(path)}: it has arrays t and u, no columns; leave --time and --columns out")
     try:
         with reading(path, DATA) as handle:
             if handle.peek(1)[:1] != b"P":  # type: ignore[attr-defined]
@@ -402,7 +399,33 @@ def _mapped(member: zipfile.ZipInfo, path: Path) -> ndarray:
         return np.memmap(path, kind, "c", file.tell(), shape, "F" if transposed else "C")
 
 
+def from_arrays(
+    t: ArrayLike, u: ArrayLike, source: str, ends: Ends = "unknown", layout: Layout = PLAIN
+) -> list[Samples]:
+    """Return the trajectory of times (T,) and readings (T, N), or (T,) of one site.
+
+    Raises:
+        InputError: they are no arrays of numbers, or of other shapes, or hold invalid data.
+    """
+    return _from_arrays({"t": _given(t, "t", source), "u": _given(u, "u", source)}, source, ends, layout)
+
+
+def _given(values: ArrayLike, name: str, source: str) -> ndarray:
+    """Return an array of numbers, NaN where one is None."""
+    try:
+        array = np.asarray(values)
+        array = array.astype(float) if array.dtype.kind == "O" else array
+    # Rows of different lengths, and objects that are no numbers.
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{source}: array {name} is none of numbers: {error}") from None
+    if array.dtype.kind not in "biufc":
+        raise InputError(f"{source}: array {name}: its values are {array.dtype}, not numbers")
+    return array
+
+
 def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends, layout: Layout) -> list[Samples]:
+    if layout.time is not None or layout.columns:
+        raise InputError(f"{source}: it has arrays t and u, no columns; leave --time and --columns out")
     _check_times(arrays["t"], source)
     t, labels = arrays["t"], arrays.get("trajectory")
     u, v, f = (_matrix(arrays, name, source) for name in ("u", "v", "f"))

@@ -2,6 +2,7 @@
 
 import doctest
 import inspect
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -278,6 +279,58 @@ def test_a_recording_shows_itself_and_what_is_suspicious():
     assert about._repr_html_().count("<table") == 1
     assert about.table["column"].tolist() == ["x1", "x2"]
     assert len(about.figure.axes) == 2
+
+
+def test_arrays_are_read_as_a_file_with_the_same_readings():
+    t = np.arange(0, 10, 0.05)
+    angle = 360 * (0.6 * t - 0.02 * t**2)
+    order = np.random.default_rng(1).permutation(len(t))
+    frame = pd.DataFrame({"t": t, "u1": angle % 360})
+    for words in (
+        {"scale": "deg"}, {"turn": 360}, {"scale": "deg", "turn": 360, "sort": True}, {"scale": -2.5},
+    ):  # fmt: skip
+        rows = order if "sort" in words else np.arange(len(t))
+        (one,) = lb.read((t[rows], angle[rows] % 360), **words).samples
+        (other,) = lb.read(frame.iloc[rows], **words).samples
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.u, other.u)
+        assert one.origin.notes == other.origin.notes
+        assert (one.origin.scale, one.origin.unit) == (other.origin.scale, other.origin.unit)
+
+
+def test_none_among_readings_is_a_missing_value():
+    (one,) = lb.read(([0, 1, 2], [[1, None], [2, 5.5], [3, 4]])).samples
+    np.testing.assert_array_equal(one.u, [[1, np.nan], [2, 5.5], [3, 4]])
+
+
+def test_the_turn_that_is_advised_for_arrays_in_degrees_unwraps_them():
+    t = np.arange(0, 10, 0.05)
+    anew = (t, 360 * (0.6 * t - 0.02 * t**2) % 360)
+    told = " ".join(lb.read(anew, scale="deg").inspect().suspicious)
+    (turn,) = re.findall(r"--turn (\S+)", told)
+    data = lb.read(anew, scale="deg", turn=float(turn))
+    assert data.notes == ("angles are unwrapped (a full turn is 360 deg)",)
+    assert "--turn" not in " ".join(data.inspect().suspicious)
+
+
+@pytest.mark.parametrize(
+    ("pair", "words", "reason"),
+    [
+        (([0, 1, 2], [[1, 2], [3, 4]]), {}, r"array u has shape \(2, 2\); it must be \(3, N\)"),
+        (([[0, 1], [2, 3]], [1, 2]), {}, r"array t has shape \(2, 2\); it must be \(T,\)"),
+        ((0.0, 1.0), {}, r"array t has shape \(\)"),
+        (([0, 1], np.ones((2, 1, 1))), {}, r"array u has shape \(2, 1, 1\)"),
+        (([0, 1], [[1, 2], [3]]), {}, "array u is none of numbers"),
+        (([0, 1], ["a", "b"]), {}, "array u: its values are <U1, not numbers"),
+        (([0, 1j], [1, 2]), {}, "array t: times are real"),
+        (([1, 0], [1, 2]), {}, "--sort puts the rows in order"),
+        (([0, 1], [1j, 2]), {"turn": 360}, "--turn is for angles"),
+        (([0, 1], [1, 2]), {"columns": "x"}, "leave --time and --columns out"),
+    ],
+)
+def test_arrays_that_are_no_recording_are_refused_by_name_and_shape(pair, words, reason):
+    with pytest.raises(InputError, match=f"arrays: .*{reason}"):
+        lb.read(pair, **words)
 
 
 def test_importing_the_package_loads_no_front():
