@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from latticebench.bench.overlay import Overlay
 from latticebench.bench.plots import panels, plot
 from latticebench.bench.provenance import origin
+from latticebench.bench.report.inspected import extent
 from latticebench.systems.errors import unknown
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ class Film:
         return path
 
     def __repr__(self) -> str:
-        return f"Film({self.overlay.source}: {self.overlay.sites} sites, {len(self.overlay.t)} rows)"
+        return f"Film({self.overlay.source}: {extent(self.overlay.sites, len(self.overlay.t))})"
 
     def _repr_html_(self) -> str:
         with tempfile.TemporaryDirectory() as folder:

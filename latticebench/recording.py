@@ -14,6 +14,7 @@ from latticebench import systems
 from latticebench.bench.inspection import Inspection
 from latticebench.bench.inspection import inspect as inspect_samples
 from latticebench.bench.overlay import of_recording
+from latticebench.bench.report.inspected import extent
 from latticebench.bench.report.rows import html_table
 from latticebench.bench.report.units import in_words, units_of
 from latticebench.labelled import as_table, is_labelled
@@ -112,10 +113,7 @@ class Recording:
     def __repr__(self) -> str:
         first, units = self.samples[0], in_words(units_of(self.samples[0].origin))
         rows = sum(len(one.t) for one in self.samples)
-        parts = [
-            f"{first.source}: {first.sites} site{'s' if first.sites > 1 else ''}, {rows} rows",
-            f"{len(self.samples)} trajectories",
-        ]
+        parts = [f"{first.source}: {extent(first.sites, rows)}", f"{len(self.samples)} trajectories"]
         parts = [*parts[: 1 + (len(self.samples) > 1)], *([units] if units else []), *self.notes]
         return f"Recording({'; '.join(parts)})"
 

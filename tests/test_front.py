@@ -333,6 +333,12 @@ def test_arrays_that_are_no_recording_are_refused_by_name_and_shape(pair, words,
         lb.read(pair, **words)
 
 
+def test_one_site_is_no_sites():
+    data = lb.read((np.arange(6.0), np.cos(np.arange(6.0))))
+    for shown in (repr(data), repr(data.inspect()), repr(data.animate())):
+        assert "1 site, 6 rows" in shown
+
+
 def test_importing_the_package_loads_no_front():
     names = [*(module.__name__ for module in MODULES), "numpy"]
     script = f"import sys, latticebench; print({{*{names}}} & set(sys.modules) or 'none')"

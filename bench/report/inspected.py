@@ -24,6 +24,11 @@ FIELDS = {"v": "velocities", "f": "an input"}
 NAMED = 20
 
 
+def extent(sites: int, rows: int) -> str:
+    """Return the size of a recording in words."""
+    return f"{sites} site{'s' if sites > 1 else ''}, {rows} row{'s' if rows > 1 else ''}"
+
+
 def lines(found: Inspection, time: str) -> list[str]:
     """Return sites, times, gaps and frequencies in words; `time` is the unit of the times."""
     seen = f", with {' and '.join(FIELDS[one] for one in found.seen)}" if found.seen else ""
@@ -31,7 +36,7 @@ def lines(found: Inspection, time: str) -> list[str]:
     every = f"every {found.interval:.4g} {time}".rstrip() + (", unevenly" if found.uneven else "")
     frequencies = ", ".join(f"{one:.4g}" for one in found.frequencies)
     return [
-        f"{found.sites} sites, {found.rows} rows{seen}; {span}, {every}",
+        f"{extent(found.sites, found.rows)}{seen}; {span}, {every}",
         *(f"gap from t = {begin:g} to {end:g}" for begin, end in found.gaps),
         f"main frequencies{f' in 1/{time}' if time else ''}: {frequencies or 'none stands out'}",
     ]
