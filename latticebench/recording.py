@@ -206,8 +206,14 @@ class Inspected:
 
     @property
     def suspicious(self) -> tuple[str, ...]:
-        """What deserves a look, one sentence each."""
-        return tuple(dict.fromkeys(line for one in self.trajectories for line in one.suspicious))
+        """What deserves a look, one sentence each; of several trajectories it begins with where it was seen."""
+        several = len(self.trajectories) > 1
+        lines = (
+            line if not several or line.startswith(f"{one.source}: ") else f"{one.source}: {line}"
+            for one in self.trajectories
+            for line in one.suspicious
+        )
+        return tuple(dict.fromkeys(lines))
 
     @property
     def table(self) -> pd.DataFrame:

@@ -339,6 +339,18 @@ def test_one_site_is_no_sites():
         assert "1 site, 6 rows" in shown
 
 
+def test_what_is_suspicious_of_several_trajectories_says_of_which():
+    t = np.arange(30.0)
+    swings, rests, strays = np.cos(t), np.full(30, 5.0), np.where(t == 9, 1e3, np.cos(t))
+    frame = pd.concat([pd.DataFrame({"trajectory": k, "t": t, "u1": u}) for k, u in enumerate((swings, rests, strays))])
+    seen = lb.read(frame).inspect()
+    assert "table, trajectory 1: u1: always 5; does this sensor work?" in seen.suspicious
+    assert all(line.startswith("table, trajectory ") for line in seen.suspicious)
+    assert any(line.startswith("table, trajectory 2: u1 at t = 9 is 1000") for line in seen.suspicious)
+    (alone,) = lb.read(frame[frame["trajectory"] == 1]).inspect().suspicious
+    assert alone.startswith("u1: always 5")
+
+
 def test_importing_the_package_loads_no_front():
     names = [*(module.__name__ for module in MODULES), "numpy"]
     script = f"import sys, latticebench; print({{*{names}}} & set(sys.modules) or 'none')"
