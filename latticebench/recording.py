@@ -14,7 +14,7 @@ from latticebench import systems
 from latticebench.bench.inspection import Inspection
 from latticebench.bench.inspection import inspect as inspect_samples
 from latticebench.bench.overlay import of_recording
-from latticebench.bench.report.inspected import extent
+from latticebench.bench.report.inspected import SHOWN, extent, lines, more
 from latticebench.bench.report.rows import html_table
 from latticebench.bench.report.units import in_words, units_of
 from latticebench.labelled import as_table, is_labelled
@@ -234,18 +234,21 @@ class Inspected:
         return picture(self.data.samples[0])
 
     def _lines(self) -> list[str]:
-        from latticebench.bench.report.inspected import lines
-
-        told = [f"Suspicious: {line}" for line in self.suspicious] or ["Nothing suspicious."]
-        for one, samples in zip(self.trajectories, self.data.samples, strict=True):
+        suspicious = self.suspicious
+        told = [f"Suspicious: {line}" for line in suspicious[:SHOWN]] or ["Nothing suspicious."]
+        told += more(suspicious, "in `.suspicious`")
+        for one, samples in list(zip(self.trajectories, self.data.samples, strict=True))[:SHOWN]:
             told += [one.source, *one.notes, *lines(one, samples.origin.time)]
-        return told
+        return [*told, *more(self.trajectories, "in `.trajectories`")]
 
     def __repr__(self) -> str:
-        return "\n".join([*self._lines(), self.table.to_string(index=False)])
+        table = self.table
+        return "\n".join([*self._lines(), table[:SHOWN].to_string(index=False), *more(table, "in `.table`")])
 
     def _repr_html_(self) -> str:
-        return f"<p>{'<br>'.join(map(html.escape, self._lines()))}</p>{html_table(self.table)}"
+        table = self.table
+        left = "".join(f"<p>{line}</p>" for line in more(table, "in `.table`"))
+        return f"<p>{'<br>'.join(map(html.escape, self._lines()))}</p>{html_table(table[:SHOWN])}{left}"
 
 
 @dataclass(frozen=True)

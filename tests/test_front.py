@@ -333,10 +333,22 @@ def test_arrays_that_are_no_recording_are_refused_by_name_and_shape(pair, words,
         lb.read(pair, **words)
 
 
-def test_one_site_is_no_sites():
-    data = lb.read((np.arange(6.0), np.cos(np.arange(6.0))))
-    for shown in (repr(data), repr(data.inspect()), repr(data.animate())):
-        assert "1 site, 6 rows" in shown
+def test_of_thousands_of_sensors_a_recording_shows_as_many_as_the_command_does():
+    u = np.cos(np.arange(12.0))[:, None] * np.arange(1, 3001)
+    u[:, ::2] = 5.0
+    seen = lb.read((np.arange(12.0), u)).inspect()
+    for shown in (repr(seen), seen._repr_html_()):
+        assert shown.count("Suspicious: ") == 200
+        assert f"{len(seen.suspicious) - 200} more in `.suspicious`" in shown
+    assert repr(seen).count("\n") < 420
+    assert repr(seen).endswith("\n2800 more in `.table`")
+    assert seen._repr_html_().endswith("<p>2800 more in `.table`</p>")
+    assert seen._repr_html_().count("<tr") == 201
+    assert len(seen.table) == 3000
+    one = lb.read((np.arange(12.0), np.cos(np.arange(12.0))))
+    many = lb.Recording(one.samples * 300).inspect()
+    assert "\n100 more in `.trajectories`\n" in repr(many)
+    assert repr(many).endswith("\n100 more in `.table`")
 
 
 def test_what_is_suspicious_of_several_trajectories_says_of_which():
@@ -349,6 +361,12 @@ def test_what_is_suspicious_of_several_trajectories_says_of_which():
     assert any(line.startswith("table, trajectory 2: u1 at t = 9 is 1000") for line in seen.suspicious)
     (alone,) = lb.read(frame[frame["trajectory"] == 1]).inspect().suspicious
     assert alone.startswith("u1: always 5")
+
+
+def test_one_site_is_no_sites():
+    data = lb.read((np.arange(6.0), np.cos(np.arange(6.0))))
+    for shown in (repr(data), repr(data.inspect()), repr(data.animate())):
+        assert "1 site, 6 rows" in shown
 
 
 def test_importing_the_package_loads_no_front():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sized
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,11 +23,18 @@ if TYPE_CHECKING:
 FIELDS = {"v": "velocities", "f": "an input"}
 # Sensors whose names are written at an axis, at most.
 NAMED = 20
+# Suspicions, sensors and trajectories that people are shown.
+SHOWN = 200
 
 
 def extent(sites: int, rows: int) -> str:
     """Return the size of a recording in words."""
     return f"{sites} site{'s' if sites > 1 else ''}, {rows} row{'s' if rows > 1 else ''}"
+
+
+def more(every: Sized, where: str) -> list[str]:
+    """Return a line that counts those beyond the `SHOWN` first and says where they are; none where all are shown."""
+    return [f"{len(every) - SHOWN} more {where}"] if len(every) > SHOWN else []
 
 
 def lines(found: Inspection, time: str) -> list[str]:
