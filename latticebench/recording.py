@@ -18,7 +18,7 @@ from latticebench.bench.report.inspected import SHOWN, extent, lines, more
 from latticebench.bench.report.rows import html_table
 from latticebench.bench.report.units import in_words, units_of
 from latticebench.labelled import as_table, is_labelled
-from latticebench.pictures import Film, Picture
+from latticebench.pictures import Film, Picture, Survey
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
@@ -28,10 +28,7 @@ from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
-
-    from latticebench.bench.overlay import Overlay
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +83,7 @@ class Recording:
         >>> lb.read((t, np.cos(1.5 * t))).plot()
         Picture(arrays: all panels)
         """
-        return Picture(self._overlay(trajectory), only)
+        return Picture(of_recording(_one_of(self, trajectory)), only)
 
     def animate(self, trajectory: int = 1) -> Film:
         """Return a film of the chain, which a notebook shows and `save` writes.
@@ -98,12 +95,7 @@ class Recording:
         >>> lb.read(([0.0, 0.1, 0.2], [[1.0, 2.0], [1.5, 2.5], [2.0, 3.0]])).animate()
         Film(arrays: 2 sites, 3 rows)
         """
-        return Film(self._overlay(trajectory))
-
-    def _overlay(self, trajectory: int) -> Overlay:
-        if not 1 <= trajectory <= len(self.samples):
-            raise InputError(f"trajectory {trajectory}: {self.samples[0].source} has {len(self.samples)}")
-        return of_recording(self.samples[trajectory - 1])
+        return Film(of_recording(_one_of(self, trajectory)))
 
     def inspect(self, model: Model | None = None) -> Inspected:
         """Return what the recording is like, and what is suspicious; with a model, whether it makes sense in that."""
@@ -182,6 +174,17 @@ def read(
     return Recording(tuple(read_all([Path(str(one)) for one in paths], "unknown", layout)))
 
 
+def _one_of(data: Recording, trajectory: int) -> Samples:
+    """Return a trajectory, counted from 1.
+
+    Raises:
+        InputError: there is no such one.
+    """
+    if not 1 <= trajectory <= len(data.samples):
+        raise InputError(f"trajectory {trajectory}: {data.samples[0].source} has {len(data.samples)}")
+    return data.samples[trajectory - 1]
+
+
 @dataclass(frozen=True, eq=False)
 class Inspected:
     """What a recording is like before any equation.
@@ -226,12 +229,16 @@ class Inspected:
         frame = pd.DataFrame(rows).rename(columns={"name": "column"})
         return frame if len(self.trajectories) > 1 else frame.drop(columns="trajectory")
 
-    @property
-    def figure(self) -> Figure:
-        """The readings of every sensor of the first trajectory, one above the other, and their spectrum."""
-        from latticebench.bench.report.inspected import picture
+    def plot(self, trajectory: int = 1) -> Survey:
+        """Draw the readings of every sensor, one above the other, and their spectrum.
 
-        return picture(self.data.samples[0])
+        Args:
+            trajectory: which one, from 1.
+
+        Raises:
+            InputError: there is no such trajectory.
+        """
+        return Survey(_one_of(self.data, trajectory))
 
     def _lines(self) -> list[str]:
         suspicious = self.suspicious

@@ -30,7 +30,8 @@ def swing(scale=1.0, noise=1e-3):
 
 def test_the_public_names_are_these_and_all_can_be_had():
     classes = [
-        "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Tables",
+        "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Survey",
+        "Tables",
     ]  # fmt: skip
     functions = ["diagnose", "fit", "limit", "read", "results", "run", "system"]
     assert sorted(lb.__all__) == sorted([*classes, *functions, *lb.ROOMS, "__version__"])
@@ -102,23 +103,26 @@ def test_a_fit_leaves_a_residual_that_can_be_drawn_in_the_unit_of_the_file():
     labels = {axes.get_xlabel() for axes in left.plot().figure.axes}
     assert labels == {"t / s", "angular frequency / (rad/s)"}
     short = lb.read((t[:3], np.cos(t[:3])))
-    for shown in (left, left.plot(), found.plot("sites"), short.animate()):
+    for shown in (left, left.plot(), found.plot("sites"), short.inspect().plot(), short.animate()):
         assert shown._repr_html_().startswith(("<p>", '<img src="data:image/'))
     with pytest.raises(InputError, match="unknown panel 'site'"):
         found.plot("site")
-    with pytest.raises(InputError, match="trajectory 2"):
-        data.plot(trajectory=2)
+    for draw in (data.plot, data.inspect().plot):
+        with pytest.raises(InputError, match="trajectory 2"):
+            draw(trajectory=2)
 
 
 def test_pictures_and_films_are_written_with_what_made_them(tmp_path):
     from PIL import Image
 
     data = lb.read(([0.0, 0.1, 0.2], [[1.0, 2.0], [1.5, 2.5], [2.0, 3.0]]))
-    with Image.open(data.plot("map").save(tmp_path / "map.png")) as picture:
-        assert "commit" in picture.info["Description"]
+    drawn = (data.plot("map"), data.inspect().plot())
+    for one in drawn:
+        with Image.open(one.save(tmp_path / "map.png")) as picture:
+            assert "commit" in picture.info["Description"]
     with Image.open(data.animate().save(tmp_path / "chain.gif")) as film:
         assert film.n_frames == 3
-    for wrong in (data.plot("map"), data.animate()):
+    for wrong in (*drawn, data.animate()):
         with pytest.raises(InputError, match="unknown ending"):
             wrong.save(tmp_path / "a.jpg")
 
@@ -278,7 +282,7 @@ def test_a_recording_shows_itself_and_what_is_suspicious():
     assert "Suspicious: x2: always 5" in repr(about)
     assert about._repr_html_().count("<table") == 1
     assert about.table["column"].tolist() == ["x1", "x2"]
-    assert len(about.figure.axes) == 2
+    assert len(about.plot().figure.axes) == 2
 
 
 def test_arrays_are_read_as_a_file_with_the_same_readings():
@@ -359,6 +363,7 @@ def test_what_is_suspicious_of_several_trajectories_says_of_which():
     assert "table, trajectory 1: u1: always 5; does this sensor work?" in seen.suspicious
     assert all(line.startswith("table, trajectory ") for line in seen.suspicious)
     assert any(line.startswith("table, trajectory 2: u1 at t = 9 is 1000") for line in seen.suspicious)
+    assert repr(seen.plot(trajectory=3)) == "Survey(table, trajectory 2: 1 site, 30 rows)"
     (alone,) = lb.read(frame[frame["trajectory"] == 1]).inspect().suspicious
     assert alone.startswith("u1: always 5")
 

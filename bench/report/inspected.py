@@ -63,13 +63,20 @@ def sensors(found: Inspection, unit: str) -> Table:
     return ["site", "column", "readings", "missing", f"least{inside}", f"most{inside}", "noise", "steps"], rows
 
 
-def picture(samples: Samples) -> Figure:
-    """Draw the readings of every sensor, one above the other, and their spectrum."""
+def picture(samples: Samples, figure: Figure | None = None) -> Figure:
+    """Draw the readings of every sensor, one above the other, and their spectrum.
+
+    Args:
+        samples: whose readings.
+        figure: to draw on, such as one of pyplot's; it gets the size that this needs. None for a new one.
+    """
     from matplotlib.figure import Figure
 
     origin = samples.origin
     values = split_parts(samples.u, samples.is_complex)[:, 0] / origin.scale
-    figure = Figure(figsize=(9, 5), layout="constrained")
+    figure = Figure() if figure is None else figure
+    figure.set_size_inches(9, 5)
+    figure.set_layout_engine("constrained")
     readings, powers = figure.subplots(1, 2, width_ratios=(2, 1))
     middle = np.nanmean(values, axis=0)
     spacing = 1.1 * float(np.nanmax(np.abs(values - middle))) or 1.0
