@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from latticebench.fitted import Fitted, Residual, fit
     from latticebench.front import Bound, Cause, Run, Tables, diagnose, limit, results, run
-    from latticebench.pictures import Film, Picture
+    from latticebench.pictures import Film, Picture, Survey
     from latticebench.recording import Inspected, Model, Recording, read, system
 
 ROOMS = ("systems", "methods", "diagnosis", "bench")
@@ -33,14 +33,15 @@ PLACES = {
     "Inspected": "recording", "Model": "recording", "Recording": "recording", "read": "recording",
     "system": "recording",
     "Fitted": "fitted", "Residual": "fitted", "fit": "fitted", "Film": "pictures", "Picture": "pictures",
+    "Survey": "pictures",
     "Bound": "front", "Cause": "front", "Run": "front", "Tables": "front", "diagnose": "front", "limit": "front",
     "results": "front", "run": "front",
 }  # fmt: skip
 
 __all__ = [
-    "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Tables",
-    "__version__", "bench", "diagnose", "diagnosis", "fit", "limit", "methods", "read", "results", "run", "system",
-    "systems",
+    "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Survey",
+    "Tables", "__version__", "bench", "diagnose", "diagnosis", "fit", "limit", "methods", "read", "results", "run",
+    "system", "systems",
 ]  # fmt: skip
 
 

@@ -149,7 +149,8 @@ def diagnose(
         what was found; see `Cause` for an example.
 
     Raises:
-        InputError: the equation cannot be set up on it, or the two recordings are not of the same chain.
+        InputError: the equation cannot be set up on it, or the two recordings are not of the same chain or not in the
+            same units.
     """
     every = model.of(data if holdout is None else Recording((*data.samples, *holdout.samples)))
     count = len(data.samples)

@@ -7,6 +7,7 @@ import functools
 import html
 import io
 import tempfile
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,9 @@ from typing import TYPE_CHECKING, Any
 from latticebench.bench.overlay import Overlay
 from latticebench.bench.plots import panels, plot
 from latticebench.bench.provenance import origin
+from latticebench.bench.report.inspected import extent, picture
 from latticebench.systems.errors import unknown
+from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,8 +28,36 @@ DENSITY = 100
 FROM_PYTHON = "from Python"
 
 
+class _Drawn(ABC):
+    """What a notebook shows as a figure, and `save` writes."""
+
+    @functools.cached_property
+    def figure(self) -> Figure:
+        """The figure, as Matplotlib has it."""
+        return self.on(None)
+
+    @abstractmethod
+    def on(self, figure: Figure | None) -> Figure:
+        """Draw on a figure of one's own, such as `pyplot.figure()`, which gets the size that is needed."""
+
+    def save(self, path: str | Path) -> Path:
+        """Write a .png, .svg or .pdf file with its provenance, whole or not at all.
+
+        Raises:
+            InputError: it has another ending, or cannot be written.
+        """
+        from latticebench.bench.figures import save
+
+        return save(self.figure, Path(path), _about())
+
+    def _repr_html_(self) -> str:
+        drawn = io.BytesIO()
+        self.figure.savefig(drawn, format="png", dpi=DENSITY)
+        return _image(drawn.getvalue(), "png", repr(self))
+
+
 @dataclass(frozen=True, eq=False)
-class Picture:
+class Picture(_Drawn):
     """Readings, and the equations beside them if there are any.
 
     Attributes:
@@ -56,32 +87,40 @@ class Picture:
             if name not in panels(self.overlay):
                 raise unknown("panel", name, panels(self.overlay), self.overlay.source)
 
-    @functools.cached_property
-    def figure(self) -> Figure:
-        """The figure, as Matplotlib has it."""
-        return self.on(None)
-
     def on(self, figure: Figure | None) -> Figure:
         """Draw on a figure of one's own, such as `pyplot.figure()`, which gets the size that the panels need."""
         return plot(self.overlay, self.only, figure=figure)
 
-    def save(self, path: str | Path) -> Path:
-        """Write a .png, .svg or .pdf file with its provenance, whole or not at all.
-
-        Raises:
-            InputError: it has another ending, or cannot be written.
-        """
-        from latticebench.bench.figures import save
-
-        return save(self.figure, Path(path), _about())
-
     def __repr__(self) -> str:
         return f"Picture({self.overlay.source}: {', '.join(self.only) or 'all panels'})"
 
-    def _repr_html_(self) -> str:
-        drawn = io.BytesIO()
-        self.figure.savefig(drawn, format="png", dpi=DENSITY)
-        return _image(drawn.getvalue(), "png", repr(self))
+
+@dataclass(frozen=True, eq=False)
+class Survey(_Drawn):
+    """The readings of every sensor, one above the other, and their spectrum, as `latticebench inspect` draws them.
+
+    Attributes:
+        samples: whose readings are drawn (`latticebench.systems.samples.Samples`).
+
+    Examples:
+        >>> import latticebench as lb
+        >>> import numpy as np
+        >>> t = np.linspace(0, 10, 200)
+        >>> survey = lb.read((t, np.cos(1.5 * t))).inspect().plot()
+        >>> survey
+        Survey(arrays: 1 site, 200 rows)
+        >>> [axes.get_xlabel() for axes in survey.figure.axes]
+        ['t', 'cycles per unit of time']
+    """
+
+    samples: Samples
+
+    def on(self, figure: Figure | None) -> Figure:
+        """Draw on a figure of one's own, such as `pyplot.figure()`, which gets the size that is needed."""
+        return picture(self.samples, figure)
+
+    def __repr__(self) -> str:
+        return f"Survey({self.samples.source}: {extent(self.samples.sites, len(self.samples.t))})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +160,7 @@ class Film:
         return path
 
     def __repr__(self) -> str:
-        return f"Film({self.overlay.source}: {self.overlay.sites} sites, {len(self.overlay.t)} rows)"
+        return f"Film({self.overlay.source}: {extent(self.overlay.sites, len(self.overlay.t))})"
 
     def _repr_html_(self) -> str:
         with tempfile.TemporaryDirectory() as folder:

@@ -8,30 +8,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-import numpy as np
 import pandas as pd
 
 from latticebench import systems
 from latticebench.bench.inspection import Inspection
 from latticebench.bench.inspection import inspect as inspect_samples
 from latticebench.bench.overlay import of_recording
+from latticebench.bench.report.inspected import SHOWN, extent, lines, more
 from latticebench.bench.report.rows import html_table
 from latticebench.bench.report.units import in_words, units_of
 from latticebench.labelled import as_table, is_labelled
-from latticebench.pictures import Film, Picture
+from latticebench.pictures import Film, Picture, Survey
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
-from latticebench.systems.readers import from_frame, read_all, unwrapped
-from latticebench.systems.samples import Samples, check_alike
+from latticebench.systems.readers import from_arrays, from_frame, read_all
+from latticebench.systems.samples import Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
-
-    from latticebench.bench.overlay import Overlay
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +83,7 @@ class Recording:
         >>> lb.read((t, np.cos(1.5 * t))).plot()
         Picture(arrays: all panels)
         """
-        return Picture(self._overlay(trajectory), only)
+        return Picture(of_recording(_one_of(self, trajectory)), only)
 
     def animate(self, trajectory: int = 1) -> Film:
         """Return a film of the chain, which a notebook shows and `save` writes.
@@ -98,12 +95,7 @@ class Recording:
         >>> lb.read(([0.0, 0.1, 0.2], [[1.0, 2.0], [1.5, 2.5], [2.0, 3.0]])).animate()
         Film(arrays: 2 sites, 3 rows)
         """
-        return Film(self._overlay(trajectory))
-
-    def _overlay(self, trajectory: int) -> Overlay:
-        if not 1 <= trajectory <= len(self.samples):
-            raise InputError(f"trajectory {trajectory}: {self.samples[0].source} has {len(self.samples)}")
-        return of_recording(self.samples[trajectory - 1])
+        return Film(of_recording(_one_of(self, trajectory)))
 
     def inspect(self, model: Model | None = None) -> Inspected:
         """Return what the recording is like, and what is suspicious; with a model, whether it makes sense in that."""
@@ -113,10 +105,7 @@ class Recording:
     def __repr__(self) -> str:
         first, units = self.samples[0], in_words(units_of(self.samples[0].origin))
         rows = sum(len(one.t) for one in self.samples)
-        parts = [
-            f"{first.source}: {first.sites} site{'s' if first.sites > 1 else ''}, {rows} rows",
-            f"{len(self.samples)} trajectories",
-        ]
+        parts = [f"{first.source}: {extent(first.sites, rows)}", f"{len(self.samples)} trajectories"]
         parts = [*parts[: 1 + (len(self.samples) > 1)], *([units] if units else []), *self.notes]
         return f"Recording({'; '.join(parts)})"
 
@@ -149,7 +138,8 @@ def read(
             Dataset also the variable.
         scale: what one unit of a reading is in the equation: a number, or the unit of the readings such as "deg".
         sort: sort rows by their times, and average rows of the same time.
-        turn: for angles that start anew after a full turn: how much that is in the unit of the readings, such as 360.
+        turn: unwrap angles that jump back after a full turn. It is a full turn in the unit of the file, such as 360;
+            neighbouring readings must be less than half of it apart. 0 leaves u as it is. v is never changed.
 
     Raises:
         InputError: it cannot be read; the message says where, and what would read it.
@@ -178,12 +168,21 @@ def read(
     if isinstance(source, pd.DataFrame):
         return Recording(tuple(from_frame(source, "table", "unknown", layout)))
     if isinstance(source, tuple) and len(source) == 2 and not isinstance(source[0], (str, Path)):
-        u = np.asarray(source[1])
-        u = u[:, None] if u.ndim == 1 else u
-        u = unwrapped(u, layout.period, "arrays") if layout.period else u
-        return Recording((Samples(np.asarray(source[0], float), u * layout.factor, source="arrays"),))
+        t, u = cast("tuple[ArrayLike, ArrayLike]", source)
+        return Recording(tuple(from_arrays(t, u, "arrays", "unknown", layout)))
     paths = [source] if isinstance(source, (str, Path)) else list(cast("Sequence[str | Path]", source))
     return Recording(tuple(read_all([Path(str(one)) for one in paths], "unknown", layout)))
+
+
+def _one_of(data: Recording, trajectory: int) -> Samples:
+    """Return a trajectory, counted from 1.
+
+    Raises:
+        InputError: there is no such one.
+    """
+    if not 1 <= trajectory <= len(data.samples):
+        raise InputError(f"trajectory {trajectory}: {data.samples[0].source} has {len(data.samples)}")
+    return data.samples[trajectory - 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,8 +209,14 @@ class Inspected:
 
     @property
     def suspicious(self) -> tuple[str, ...]:
-        """What deserves a look, one sentence each."""
-        return tuple(dict.fromkeys(line for one in self.trajectories for line in one.suspicious))
+        """What deserves a look, one sentence each; of several trajectories it begins with where it was seen."""
+        several = len(self.trajectories) > 1
+        lines = (
+            line if not several or line.startswith(f"{one.source}: ") else f"{one.source}: {line}"
+            for one in self.trajectories
+            for line in one.suspicious
+        )
+        return tuple(dict.fromkeys(lines))
 
     @property
     def table(self) -> pd.DataFrame:
@@ -224,26 +229,33 @@ class Inspected:
         frame = pd.DataFrame(rows).rename(columns={"name": "column"})
         return frame if len(self.trajectories) > 1 else frame.drop(columns="trajectory")
 
-    @property
-    def figure(self) -> Figure:
-        """The readings of every sensor of the first trajectory, one above the other, and their spectrum."""
-        from latticebench.bench.report.inspected import picture
+    def plot(self, trajectory: int = 1) -> Survey:
+        """Draw the readings of every sensor, one above the other, and their spectrum.
 
-        return picture(self.data.samples[0])
+        Args:
+            trajectory: which one, from 1.
+
+        Raises:
+            InputError: there is no such trajectory.
+        """
+        return Survey(_one_of(self.data, trajectory))
 
     def _lines(self) -> list[str]:
-        from latticebench.bench.report.inspected import lines
-
-        told = [f"Suspicious: {line}" for line in self.suspicious] or ["Nothing suspicious."]
-        for one, samples in zip(self.trajectories, self.data.samples, strict=True):
+        suspicious = self.suspicious
+        told = [f"Suspicious: {line}" for line in suspicious[:SHOWN]] or ["Nothing suspicious."]
+        told += more(suspicious, "in `.suspicious`")
+        for one, samples in list(zip(self.trajectories, self.data.samples, strict=True))[:SHOWN]:
             told += [one.source, *one.notes, *lines(one, samples.origin.time)]
-        return told
+        return [*told, *more(self.trajectories, "in `.trajectories`")]
 
     def __repr__(self) -> str:
-        return "\n".join([*self._lines(), self.table.to_string(index=False)])
+        table = self.table
+        return "\n".join([*self._lines(), table[:SHOWN].to_string(index=False), *more(table, "in `.table`")])
 
     def _repr_html_(self) -> str:
-        return f"<p>{'<br>'.join(map(html.escape, self._lines()))}</p>{html_table(self.table)}"
+        table = self.table
+        left = "".join(f"<p>{line}</p>" for line in more(table, "in `.table`"))
+        return f"<p>{'<br>'.join(map(html.escape, self._lines()))}</p>{html_table(table[:SHOWN])}{left}"
 
 
 @dataclass(frozen=True)
@@ -270,9 +282,14 @@ class Model:
         return library("terms", self.terms)
 
     def of(self, data: Recording) -> list[Samples]:
-        """Return recordings with the ends of this model."""
+        """Return recordings with the ends of this model.
+
+        Raises:
+            InputError: trajectories differ in their sites, columns or units.
+        """
         found = [replace(one, ends=self.ends) for one in data.samples]
         check_alike(found)
+        check_units(found)
         return found
 
     def __repr__(self) -> str:

@@ -43,8 +43,8 @@ class Layout:
         scale: what one unit of a reading is in the equation: a number such as "1e-3", or the unit of the readings,
             such as "deg", which become radians. It holds for u and v.
         sort: put rows in the order of their times, and average rows of the same time.
-        turn: after how much, in the unit of the file, a reading of u starts anew, such as 360; such readings are
-            unwrapped. 0 where they go on.
+        turn: unwrap angles that jump back after a full turn. It is a full turn in the unit of the file, such as 360;
+            neighbouring readings must be less than half of it apart. 0 leaves u as it is. v is never changed.
     """
 
     time: str | None = None
@@ -55,13 +55,15 @@ class Layout:
 
     @property
     def period(self) -> float:
-        """After how much a reading starts anew; 0 where it goes on.
+        """A full turn in the unit of the file; 0 where nothing is unwrapped.
 
         Raises:
             InputError: it is not finite, or less than 0.
         """
         if not (math.isfinite(self.turn) and self.turn >= 0):
-            raise InputError(f"--turn {self.turn:g}: a full turn is a finite number above 0, such as 360")
+            raise InputError(
+                f"--turn {self.turn:g}: a full turn is a finite number above 0 in the unit of the file, such as 360"
+            )
         return self.turn
 
     @property

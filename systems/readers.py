@@ -24,7 +24,8 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.files import DATA, check_regular, reading, shown
 from latticebench.systems.folders import ZARR, files_in, partition, zarr_arrays
 from latticebench.systems.layout import UNITS, Layout, choose, quoted
-from latticebench.systems.samples import Origin, Samples, check_alike
+from latticebench.systems.ordering import averaged, in_order, unwrapped
+from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 from latticebench.systems.tables import Table, check_count, named_once, read_csv, read_sheet
 
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
     import pandas
     import pyarrow
     from numpy import ndarray
+    from numpy.typing import ArrayLike
+
+    from latticebench.systems.ordering import Arrays
 
 # What is written and read, and what is only read.
 FORMATS = (".csv", ".npz", ".parquet")
@@ -60,7 +64,7 @@ def read(path: Path, ends: Ends = "unknown", layout: Layout = PLAIN) -> list[Sam
     source = shown(path)
     match path.suffix.lower():
         case ".npz":
-            return _from_arrays(_read_npz(path, layout), source, ends, layout)
+            return _from_arrays(_read_npz(path), source, ends, layout)
         case ".parquet":
             return _from_table(_read_parquet(path, layout), source, ends, layout)
         case ".xlsx":
@@ -77,22 +81,13 @@ def read_all(paths: Sequence[Path], ends: Ends = "unknown", layout: Layout = PLA
     """
     data = [samples for path in paths for samples in read(path, ends, layout)]
     check_alike(data)
-    for one in data[1:]:
-        for name in ("time", "unit"):
-            units = [getattr(samples.origin, name) or "no unit" for samples in (one, data[0])]
-            if units[0] != units[1]:
-                raise InputError(
-                    f"{one.source}: {'times' if name == 'time' else 'readings'} in {units[0]}, those of "
-                    f"{data[0].source} in {units[1]}; read them apart, or bring them to one unit"
-                )
+    check_units(data)
     return data
 
 
 def _from_folder(folder: Path, ends: Ends, layout: Layout) -> list[Samples]:
     """Return the trajectories of a Zarr store, of a Parquet table in parts, or of all files in a folder."""
     if folder.suffix.lower() == ZARR:
-        if layout.time is not None or layout.columns:
-            raise InputError(f"{shown(folder)}: it has arrays t and u, no columns; leave --time and --columns out")
         arrays = zarr_arrays(folder, ARRAYS)
         _check_names(list(arrays), shown(folder))
         return _from_arrays(arrays, shown(folder), ends, layout)
@@ -145,7 +140,7 @@ class _Told:
     turn: float = 0.0
 
 
-def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, told: _Told) -> list[Samples]:
+def _trajectories(arrays: Arrays, labels: ndarray | None, told: _Told) -> list[Samples]:
     """Return the samples of arrays t, u, v and f, one trajectory per label in order of first appearance."""
     if labels is None:
         return [_samples(arrays, told)]
@@ -162,71 +157,25 @@ def _trajectories(arrays: dict[str, ndarray | None], labels: ndarray | None, tol
     return found
 
 
-def _samples(arrays: dict[str, ndarray | None], told: _Told) -> Samples:
+def _samples(arrays: Arrays, told: _Told) -> Samples:
     """Return one trajectory, in the units of the equation."""
-    arrays, origin = _in_order(arrays, told)
+    arrays, notes = in_order(arrays, told.source, told.time, sort=told.sort)
+    origin = told.origin.noting(*notes)
+    if told.turn:
+        assert arrays["u"] is not None
+        # Before rows of the same time are averaged: halfway from 359 to 1 is 360, not 180.
+        arrays = {**arrays, "u": unwrapped(arrays["u"], told.turn, told.source)}
+        unit = f" {origin.unit}" if origin.unit else ""
+        origin = origin.noting(f"angles are unwrapped (a full turn is {told.turn:g}{unit})")
+    if told.sort:
+        arrays, notes = averaged(arrays)
+        origin = origin.noting(*notes)
     t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
     assert t is not None
     assert u is not None
-    if told.turn:
-        u = unwrapped(u, told.turn, told.source)
-        origin = origin.noting(f"readings that start anew after {told.turn:g} are unwrapped")
     if origin.scale != 1:
         u, v = u * origin.scale, None if v is None else v * origin.scale
     return Samples(t, u, v, f, None, told.source, told.ends, origin)
-
-
-def unwrapped(u: ndarray, turn: float, source: str) -> ndarray:
-    """Return readings (T, N) that go on where they started anew after a full turn.
-
-    Raises:
-        InputError: they are complex.
-    """
-    if np.iscomplexobj(u):
-        raise InputError(f"{source}: --turn is for angles; these readings are complex")
-    found = np.array(u, float)
-    for column in found.T:
-        seen = np.isfinite(column)
-        column[seen] = np.unwrap(column[seen], period=turn)
-    return found
-
-
-def _in_order(arrays: dict[str, ndarray | None], told: _Told) -> tuple[dict[str, ndarray | None], Origin]:
-    """Return arrays whose times increase.
-
-    Raises:
-        InputError: they do not, and were not to be sorted.
-    """
-    t = arrays["t"]
-    assert t is not None
-    steps = np.diff(t)
-    if not np.all(np.isfinite(t)) or np.all(steps > 0):
-        return arrays, told.origin
-    if not told.sort:
-        row = int(np.flatnonzero(steps <= 0)[0]) + 1
-        remedy = "--sort averages rows of the same time" if t[row] == t[row - 1] else "--sort puts the rows in order"
-        raise InputError(
-            f"{told.source}: row {row + 1}, column {told.time}: time {t[row]:g} after {t[row - 1]:g}; times must "
-            f"increase: {remedy}; several trajectories need a column 'trajectory'"
-        )
-    times, group = np.unique(t, return_inverse=True)
-    order = np.argsort(group, kind="stable")
-    begins = np.flatnonzero(np.diff(group[order], prepend=-1))
-    found: dict[str, ndarray | None] = {"t": times}
-    for name in ("u", "v", "f"):
-        array = arrays[name]
-        if array is None:
-            found[name] = None
-            continue
-        seen = ~np.isnan(array[order])
-        total = np.add.reduceat(np.where(seen, array[order], 0), begins)
-        with np.errstate(invalid="ignore"):
-            found[name] = total / np.add.reduceat(seen, begins, dtype=float)
-    early = np.count_nonzero(steps < 0)
-    notes = [f"{early} row(s) came too late; all are put in the order of their times"] if early else []
-    if len(times) < len(t):
-        notes.append(f"{len(t) - len(times)} row(s) have the time of another one; such rows are averaged")
-    return found, told.origin.noting(*notes)
 
 
 # CSV and Parquet
@@ -319,6 +268,8 @@ def _with_seconds(body: pandas.DataFrame, time: str, source: str) -> tuple[panda
     import pandas as pd
 
     given = body[time]
+    if given.dtype.kind in "fiu":
+        return body, ""
     if given.dtype.kind != "M":
         texts = given.astype("string").fillna("").str.strip().str.replace(",", ".", regex=False)
         if re.match(r"\d{4}-\d\d-\d\d", texts.iloc[0], re.ASCII):
@@ -377,10 +328,8 @@ def _field(numbers: dict[str, ndarray], prefix: str, source: str) -> ndarray | N
 # NPZ
 
 
-def _read_npz(path: Path, layout: Layout) -> dict[str, ndarray]:
+def _read_npz(path: Path) -> dict[str, ndarray]:
     """Return the arrays, whose names, types and sizes are looked at before they are unpacked."""
-    if layout.time is not None or layout.columns:
-        raise InputError(f"{shown(path)}: it has arrays t and u, no columns; leave --time and --columns out")
     try:
         with reading(path, DATA) as handle:
             if handle.peek(1)[:1] != b"P":  # type: ignore[attr-defined]
@@ -450,7 +399,33 @@ def _mapped(member: zipfile.ZipInfo, path: Path) -> ndarray:
         return np.memmap(path, kind, "c", file.tell(), shape, "F" if transposed else "C")
 
 
+def from_arrays(
+    t: ArrayLike, u: ArrayLike, source: str, ends: Ends = "unknown", layout: Layout = PLAIN
+) -> list[Samples]:
+    """Return the trajectory of times (T,) and readings (T, N), or (T,) of one site.
+
+    Raises:
+        InputError: they are no arrays of numbers, or of other shapes, or hold invalid data.
+    """
+    return _from_arrays({"t": _given(t, "t", source), "u": _given(u, "u", source)}, source, ends, layout)
+
+
+def _given(values: ArrayLike, name: str, source: str) -> ndarray:
+    """Return an array of numbers, NaN where one is None."""
+    try:
+        array = np.asarray(values)
+        array = array.astype(float) if array.dtype.kind == "O" else array
+    # Rows of different lengths, and objects that are no numbers.
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{source}: array {name} is none of numbers: {error}") from None
+    if array.dtype.kind not in "biufc":
+        raise InputError(f"{source}: array {name}: its values are {array.dtype}, not numbers")
+    return array
+
+
 def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends, layout: Layout) -> list[Samples]:
+    if layout.time is not None or layout.columns:
+        raise InputError(f"{source}: it has arrays t and u, no columns; leave --time and --columns out")
     _check_times(arrays["t"], source)
     t, labels = arrays["t"], arrays.get("trajectory")
     u, v, f = (_matrix(arrays, name, source) for name in ("u", "v", "f"))

@@ -278,3 +278,20 @@ def check_alike(data: Sequence[Samples]) -> None:
                 raise InputError(
                     f"{samples.source}: only one of it and {first.source} has columns {name}1..{name}N; fit them apart"
                 )
+
+
+def check_units(data: Sequence[Samples]) -> None:
+    """Check that times, readings, and u in the equation have the same units in all trajectories.
+
+    Raises:
+        InputError: two of them differ.
+    """
+    named = {"time": "times", "unit": "readings", "becomes": "scaled readings"}
+    for samples in data[1:]:
+        for name, what in named.items():
+            own, first = (getattr(one.origin, name) or "no unit" for one in (samples, data[0]))
+            if own != first:
+                raise InputError(
+                    f"{samples.source}: {what} in {own}, those of {data[0].source} in {first}; read them apart, or "
+                    "bring them to one unit"
+                )

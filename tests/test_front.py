@@ -2,6 +2,7 @@
 
 import doctest
 import inspect
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -29,7 +30,8 @@ def swing(scale=1.0, noise=1e-3):
 
 def test_the_public_names_are_these_and_all_can_be_had():
     classes = [
-        "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Tables",
+        "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Survey",
+        "Tables",
     ]  # fmt: skip
     functions = ["diagnose", "fit", "limit", "read", "results", "run", "system"]
     assert sorted(lb.__all__) == sorted([*classes, *functions, *lb.ROOMS, "__version__"])
@@ -101,23 +103,26 @@ def test_a_fit_leaves_a_residual_that_can_be_drawn_in_the_unit_of_the_file():
     labels = {axes.get_xlabel() for axes in left.plot().figure.axes}
     assert labels == {"t / s", "angular frequency / (rad/s)"}
     short = lb.read((t[:3], np.cos(t[:3])))
-    for shown in (left, left.plot(), found.plot("sites"), short.animate()):
+    for shown in (left, left.plot(), found.plot("sites"), short.inspect().plot(), short.animate()):
         assert shown._repr_html_().startswith(("<p>", '<img src="data:image/'))
     with pytest.raises(InputError, match="unknown panel 'site'"):
         found.plot("site")
-    with pytest.raises(InputError, match="trajectory 2"):
-        data.plot(trajectory=2)
+    for draw in (data.plot, data.inspect().plot):
+        with pytest.raises(InputError, match="trajectory 2"):
+            draw(trajectory=2)
 
 
 def test_pictures_and_films_are_written_with_what_made_them(tmp_path):
     from PIL import Image
 
     data = lb.read(([0.0, 0.1, 0.2], [[1.0, 2.0], [1.5, 2.5], [2.0, 3.0]]))
-    with Image.open(data.plot("map").save(tmp_path / "map.png")) as picture:
-        assert "commit" in picture.info["Description"]
+    drawn = (data.plot("map"), data.inspect().plot())
+    for one in drawn:
+        with Image.open(one.save(tmp_path / "map.png")) as picture:
+            assert "commit" in picture.info["Description"]
     with Image.open(data.animate().save(tmp_path / "chain.gif")) as film:
         assert film.n_frames == 3
-    for wrong in (data.plot("map"), data.animate()):
+    for wrong in (*drawn, data.animate()):
         with pytest.raises(InputError, match="unknown ending"):
             wrong.save(tmp_path / "a.jpg")
 
@@ -231,6 +236,24 @@ def test_a_diagnosis_takes_effects_of_ones_own_and_forecasts_another_recording(t
         lb.diagnose(first, PENDULUM, holdout=lb.read((t, np.stack([np.cos(t), np.sin(t)], axis=1))))
 
 
+@pytest.mark.parametrize(
+    ("first", "later", "words"),
+    [
+        (("t [s]", "x [deg]", "deg"), ("t [ms]", "x [deg]", "deg"), "times in ms, those of table in s"),
+        (("t [s]", "x [mm]", 1), ("t [s]", "x [cm]", 1), "readings in cm, those of table in mm"),
+        (("t [s]", "x [deg]", "deg"), ("t [s]", "x [deg]", 1), "scaled readings in deg, those of table in rad"),
+    ],
+)
+def test_a_recording_in_other_units_is_no_holdout(first, later, words):
+    t = np.arange(0, 12, 0.1)
+    found = []
+    for time, column, scale in (first, later):
+        frame = pd.DataFrame({time: t, column: 3 * np.cos(2 * t) + 0.1 * np.sin(97 * t)})
+        found.append(lb.read(frame, time=time, columns=column, scale=scale))
+    with pytest.raises(InputError, match=f"table: {words}; read them apart"):
+        lb.diagnose(found[0], PENDULUM, holdout=found[1])
+
+
 def test_an_interrupted_diagnosis_returns_what_it_knows():
     def stop(text):
         if "without" in text or "no name" in text:
@@ -259,7 +282,96 @@ def test_a_recording_shows_itself_and_what_is_suspicious():
     assert "Suspicious: x2: always 5" in repr(about)
     assert about._repr_html_().count("<table") == 1
     assert about.table["column"].tolist() == ["x1", "x2"]
-    assert len(about.figure.axes) == 2
+    assert len(about.plot().figure.axes) == 2
+
+
+def test_arrays_are_read_as_a_file_with_the_same_readings():
+    t = np.arange(0, 10, 0.05)
+    angle = 360 * (0.6 * t - 0.02 * t**2)
+    order = np.random.default_rng(1).permutation(len(t))
+    frame = pd.DataFrame({"t": t, "u1": angle % 360})
+    for words in (
+        {"scale": "deg"}, {"turn": 360}, {"scale": "deg", "turn": 360, "sort": True}, {"scale": -2.5},
+    ):  # fmt: skip
+        rows = order if "sort" in words else np.arange(len(t))
+        (one,) = lb.read((t[rows], angle[rows] % 360), **words).samples
+        (other,) = lb.read(frame.iloc[rows], **words).samples
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.u, other.u)
+        assert one.origin.notes == other.origin.notes
+        assert (one.origin.scale, one.origin.unit) == (other.origin.scale, other.origin.unit)
+
+
+def test_none_among_readings_is_a_missing_value():
+    (one,) = lb.read(([0, 1, 2], [[1, None], [2, 5.5], [3, 4]])).samples
+    np.testing.assert_array_equal(one.u, [[1, np.nan], [2, 5.5], [3, 4]])
+
+
+def test_the_turn_that_is_advised_for_arrays_in_degrees_unwraps_them():
+    t = np.arange(0, 10, 0.05)
+    anew = (t, 360 * (0.6 * t - 0.02 * t**2) % 360)
+    told = " ".join(lb.read(anew, scale="deg").inspect().suspicious)
+    (turn,) = re.findall(r"--turn (\S+)", told)
+    data = lb.read(anew, scale="deg", turn=float(turn))
+    assert data.notes == ("angles are unwrapped (a full turn is 360 deg)",)
+    assert "--turn" not in " ".join(data.inspect().suspicious)
+
+
+@pytest.mark.parametrize(
+    ("pair", "words", "reason"),
+    [
+        (([0, 1, 2], [[1, 2], [3, 4]]), {}, r"array u has shape \(2, 2\); it must be \(3, N\)"),
+        (([[0, 1], [2, 3]], [1, 2]), {}, r"array t has shape \(2, 2\); it must be \(T,\)"),
+        ((0.0, 1.0), {}, r"array t has shape \(\)"),
+        (([0, 1], np.ones((2, 1, 1))), {}, r"array u has shape \(2, 1, 1\)"),
+        (([0, 1], [[1, 2], [3]]), {}, "array u is none of numbers"),
+        (([0, 1], ["a", "b"]), {}, "array u: its values are <U1, not numbers"),
+        (([0, 1j], [1, 2]), {}, "array t: times are real"),
+        (([1, 0], [1, 2]), {}, "--sort puts the rows in order"),
+        (([0, 1], [1j, 2]), {"turn": 360}, "--turn is for angles"),
+        (([0, 1], [1, 2]), {"columns": "x"}, "leave --time and --columns out"),
+    ],
+)
+def test_arrays_that_are_no_recording_are_refused_by_name_and_shape(pair, words, reason):
+    with pytest.raises(InputError, match=f"arrays: .*{reason}"):
+        lb.read(pair, **words)
+
+
+def test_of_thousands_of_sensors_a_recording_shows_as_many_as_the_command_does():
+    u = np.cos(np.arange(12.0))[:, None] * np.arange(1, 3001)
+    u[:, ::2] = 5.0
+    seen = lb.read((np.arange(12.0), u)).inspect()
+    for shown in (repr(seen), seen._repr_html_()):
+        assert shown.count("Suspicious: ") == 200
+        assert f"{len(seen.suspicious) - 200} more in `.suspicious`" in shown
+    assert repr(seen).count("\n") < 420
+    assert repr(seen).endswith("\n2800 more in `.table`")
+    assert seen._repr_html_().endswith("<p>2800 more in `.table`</p>")
+    assert seen._repr_html_().count("<tr") == 201
+    assert len(seen.table) == 3000
+    one = lb.read((np.arange(12.0), np.cos(np.arange(12.0))))
+    many = lb.Recording(one.samples * 300).inspect()
+    assert "\n100 more in `.trajectories`\n" in repr(many)
+    assert repr(many).endswith("\n100 more in `.table`")
+
+
+def test_what_is_suspicious_of_several_trajectories_says_of_which():
+    t = np.arange(30.0)
+    swings, rests, strays = np.cos(t), np.full(30, 5.0), np.where(t == 9, 1e3, np.cos(t))
+    frame = pd.concat([pd.DataFrame({"trajectory": k, "t": t, "u1": u}) for k, u in enumerate((swings, rests, strays))])
+    seen = lb.read(frame).inspect()
+    assert "table, trajectory 1: u1: always 5; does this sensor work?" in seen.suspicious
+    assert all(line.startswith("table, trajectory ") for line in seen.suspicious)
+    assert any(line.startswith("table, trajectory 2: u1 at t = 9 is 1000") for line in seen.suspicious)
+    assert repr(seen.plot(trajectory=3)) == "Survey(table, trajectory 2: 1 site, 30 rows)"
+    (alone,) = lb.read(frame[frame["trajectory"] == 1]).inspect().suspicious
+    assert alone.startswith("u1: always 5")
+
+
+def test_one_site_is_no_sites():
+    data = lb.read((np.arange(6.0), np.cos(np.arange(6.0))))
+    for shown in (repr(data), repr(data.inspect()), repr(data.animate())):
+        assert "1 site, 6 rows" in shown
 
 
 def test_importing_the_package_loads_no_front():

@@ -19,8 +19,9 @@ model = lb.Model("u[n+1]+u[n-1]-2*u[n]; sin(u[n])", order=2, ends="free")
 fit = lb.fit(data, model, method="trajectory")
 """
 SHOWN = (
-    "data", "data.plot()", "data.animate()", "data.to_frame()", "data.inspect(model)", "model", "fit", "fit.table",
-    "fit.covariance", "fit.confidence()", "fit.simulate()", "fit.residual", "fit.residual.plot()", "fit.plot()",
+    "data", "data.plot()", "data.animate()", "data.to_frame()", "data.inspect(model)",
+    "data.inspect(model).plot()", "model", "fit", "fit.table", "fit.covariance", "fit.confidence()", "fit.simulate()",
+    "fit.residual", "fit.residual.plot()", "fit.plot()",
     "lb.diagnose(data, model)", "lb.limit(data, model)", 'lb.results("paper")',
     'lb.run("tiny", only=["phi4 noise*"], methods=["zero"])',
 )  # fmt: skip

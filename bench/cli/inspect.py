@@ -20,8 +20,6 @@ EPILOG = (
     '--terms "sin(u\\[n])" --out pendula.png'
 )
 PICTURES = (".png", ".svg", ".pdf")
-# Sensors and suspicions that are shown on the screen.
-SHOWN = 200
 
 
 def inspect(
@@ -91,7 +89,7 @@ def _terms(system: str | None, terms: str | None) -> Library | None:
 
 def _show(found: Inspection, samples: Samples) -> None:
     """Print what a recording is like, the suspicious first."""
-    from latticebench.bench.report.inspected import lines, sensors
+    from latticebench.bench.report.inspected import SHOWN, lines, more, sensors
     from latticebench.bench.report.screen import console, show_rows
     from latticebench.systems.errors import printable
 
@@ -107,11 +105,11 @@ def _show(found: Inspection, samples: Samples) -> None:
         say("Nothing suspicious.")
     for line in found.suspicious[:SHOWN]:
         say(f"Suspicious: {line}", "bold red")
-    if len(found.suspicious) > SHOWN:
-        say(f"{len(found.suspicious) - SHOWN} more are suspicious; --json has all")
+    for line in more(found.suspicious, "are suspicious; --json has all"):
+        say(line)
     for line in lines(found, samples.origin.time):
         say(line)
     heads, rows = sensors(found, samples.origin.unit)
     show_rows(heads, rows[:SHOWN])
-    if len(rows) > SHOWN:
-        say(f"{len(rows) - SHOWN} more sensors; --json has all")
+    for line in more(rows, "sensors; --json has all"):
+        say(line)

@@ -88,7 +88,9 @@ def limit(
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
     elif layout != layout_of(None, None, "1", False, 0.0):
-        raise InputError("--time, --columns, --scale and --sort say how files are read: give files, or leave them out")
+        raise InputError(
+            "--time, --columns, --scale, --sort and --turn say how files are read: give files, or leave them out"
+        )
     else:
         described.pop("set", None)
         case = case_of(

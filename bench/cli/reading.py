@@ -54,8 +54,8 @@ Turn = Annotated[
     float,
     typer.Option(
         "--turn", metavar="NUMBER", rich_help_panel=PANEL,
-        help="For angles that start anew after a full turn: how much that is in the unit of the file, such as 360; "
-        "they are unwrapped.",
+        help="Unwrap angles that jump back after a full turn. NUMBER is a full turn in the unit of the file, such as "
+        "360; neighbouring readings must be less than half of it apart. v is not changed.",
     ),
 ]  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sized
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,18 @@ if TYPE_CHECKING:
 FIELDS = {"v": "velocities", "f": "an input"}
 # Sensors whose names are written at an axis, at most.
 NAMED = 20
+# Suspicions, sensors and trajectories that people are shown.
+SHOWN = 200
+
+
+def extent(sites: int, rows: int) -> str:
+    """Return the size of a recording in words."""
+    return f"{sites} site{'s' if sites > 1 else ''}, {rows} row{'s' if rows > 1 else ''}"
+
+
+def more(every: Sized, where: str) -> list[str]:
+    """Return a line that counts those beyond the `SHOWN` first and says where they are; none where all are shown."""
+    return [f"{len(every) - SHOWN} more {where}"] if len(every) > SHOWN else []
 
 
 def lines(found: Inspection, time: str) -> list[str]:
@@ -31,7 +44,7 @@ def lines(found: Inspection, time: str) -> list[str]:
     every = f"every {found.interval:.4g} {time}".rstrip() + (", unevenly" if found.uneven else "")
     frequencies = ", ".join(f"{one:.4g}" for one in found.frequencies)
     return [
-        f"{found.sites} sites, {found.rows} rows{seen}; {span}, {every}",
+        f"{extent(found.sites, found.rows)}{seen}; {span}, {every}",
         *(f"gap from t = {begin:g} to {end:g}" for begin, end in found.gaps),
         f"main frequencies{f' in 1/{time}' if time else ''}: {frequencies or 'none stands out'}",
     ]
@@ -50,13 +63,20 @@ def sensors(found: Inspection, unit: str) -> Table:
     return ["site", "column", "readings", "missing", f"least{inside}", f"most{inside}", "noise", "steps"], rows
 
 
-def picture(samples: Samples) -> Figure:
-    """Draw the readings of every sensor, one above the other, and their spectrum."""
+def picture(samples: Samples, figure: Figure | None = None) -> Figure:
+    """Draw the readings of every sensor, one above the other, and their spectrum.
+
+    Args:
+        samples: whose readings.
+        figure: to draw on, such as one of pyplot's; it gets the size that this needs. None for a new one.
+    """
     from matplotlib.figure import Figure
 
     origin = samples.origin
     values = split_parts(samples.u, samples.is_complex)[:, 0] / origin.scale
-    figure = Figure(figsize=(9, 5), layout="constrained")
+    figure = Figure() if figure is None else figure
+    figure.set_size_inches(9, 5)
+    figure.set_layout_engine("constrained")
     readings, powers = figure.subplots(1, 2, width_ratios=(2, 1))
     middle = np.nanmean(values, axis=0)
     spacing = 1.1 * float(np.nanmax(np.abs(values - middle))) or 1.0

@@ -184,7 +184,7 @@ def test_an_angle_that_starts_anew_after_a_full_turn_is_pointed_at_and_one_that_
     (remedy,) = re.findall(r"--turn (\S+)", shown["anew"])
     went_on, told = typed("inspect", "anew.csv", *read, "--turn", remedy)
     assert "starts anew" not in went_on
-    assert f"readings that start anew after {turn:g} are unwrapped" in " ".join(went_on.split()) + told
+    assert f"angles are unwrapped (a full turn is {turn:g} {unit})" in " ".join(went_on.split()) + told
 
 
 @pytest.mark.slow

@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from commandline import no_longer_than
 from latticebench.systems.errors import InputError
 from latticebench.systems.layout import Layout, unit_of
-from latticebench.systems.readers import from_frame, read, read_all, unwrapped
+from latticebench.systems.ordering import unwrapped
+from latticebench.systems.readers import from_frame, read, read_all
 
 PENDULA = Layout("time_s", ("theta_*_deg",), "deg")
 U = np.array([[10.5, -20.25], [11.0, np.nan], [-3.0, 4.0]])
@@ -166,6 +168,14 @@ def test_what_is_no_time_among_dates_and_times_of_day_is_told_by_its_place(tmp_p
     assert f"row 2, column t: {second!r} is no {kind}" in str(caught.value)
 
 
+def test_times_that_are_numbers_are_not_looked_through_for_dates():
+    t = np.arange(2e6)
+    table = pd.DataFrame({"t": t, "u1": t})
+    with no_longer_than(0.25):
+        (one,) = from_frame(table, "table")
+    np.testing.assert_array_equal(one.t, t)
+
+
 def test_additional_columns_are_left_out_and_named(tmp_path):
     (one,) = read(written(tmp_path, "t,u1,speed\n0,1,x\n1,2,y\n"))
     assert one.origin.notes == ("not read: speed",)
@@ -221,17 +231,45 @@ def test_an_angle_that_starts_anew_goes_on_once_its_turn_is_told(start, steps):
     np.testing.assert_allclose(told - told[0], np.outer(angle - angle[0], [1, -1]), atol=1e-7)
 
 
+@pytest.mark.parametrize(("head", "unit"), [("u1", ""), ("u1 [deg]", " deg")])
+def test_angles_that_are_unwrapped_are_told_with_their_turn_in_the_unit_of_the_file(tmp_path, head, unit):
+    path = written(tmp_path, f"t,{head}\n0,350\n1,10\n")
+    (one,) = read(path, layout=Layout(columns=(head,), turn=360.0))
+    assert f"angles are unwrapped (a full turn is 360{unit})" in one.origin.notes
+
+
 def test_a_turn_goes_on_across_readings_that_are_missing(tmp_path):
     path = written(tmp_path, "t,u1,v1\n0,350,1\n1,,1\n2,10,1\n3,30,1\n")
     (one,) = read(path, layout=Layout(scale="deg", turn=360.0))
     np.testing.assert_allclose(np.rad2deg(one.u[:, 0]), [350, np.nan, 370, 390])
     np.testing.assert_allclose(np.rad2deg(one.v), 1.0)
-    assert "readings that start anew after 360 are unwrapped" in one.origin.notes
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        "0,350,4\n1,359,1\n1,1,2\n2,10,1\n",
+        "2,10,1\n1,359,1\n0,350,4\n1,1,2\n",
+        "0,350,4\n1,359,1\n1,1,2\n1,,\n2,,\n2,10,1\n",
+    ],
+)
+def test_an_angle_goes_on_before_readings_of_the_same_time_are_averaged(tmp_path, rows):
+    path = written(tmp_path, f"t,u1,v1\n{rows}")
+    (one,) = read(path, layout=Layout(sort=True, turn=360.0))
+    np.testing.assert_array_equal(one.t, [0, 1, 2])
+    np.testing.assert_allclose(one.u[:, 0], [350, 360, 370])
+    np.testing.assert_allclose(one.v[:, 0], [4, 1.5, 1])
+
+
+def test_a_time_that_is_missing_is_told_by_its_row_where_rows_are_sorted(tmp_path):
+    path = written(tmp_path, "t,u1\n0,1\n0,2\n,3\n1,4\n")
+    with pytest.raises(InputError, match="row 3, column t: the time is missing"):
+        read(path, layout=Layout(sort=True))
 
 
 @pytest.mark.parametrize("turn", [np.nan, np.inf, -360.0])
 def test_a_turn_that_is_none_is_refused(turn):
-    with pytest.raises(InputError, match="--turn"):
+    with pytest.raises(InputError, match=r"--turn .*in the unit of the file"):
         _ = Layout(turn=turn).period
 
 
