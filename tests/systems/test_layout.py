@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from commandline import no_longer_than
 from latticebench.systems.errors import InputError
 from latticebench.systems.layout import Layout, unit_of
 from latticebench.systems.ordering import unwrapped
@@ -166,14 +165,6 @@ def test_what_is_no_time_among_dates_and_times_of_day_is_told_by_its_place(tmp_p
     with pytest.raises(InputError) as caught:
         read(written(tmp_path, f"t;u1\n{first};1\n{second};2\n{first};3\n"))
     assert f"row 2, column t: {second!r} is no {kind}" in str(caught.value)
-
-
-def test_times_that_are_numbers_are_not_looked_through_for_dates():
-    t = np.arange(2e6)
-    table = pd.DataFrame({"t": t, "u1": t})
-    with no_longer_than(0.25):
-        (one,) = from_frame(table, "table")
-    np.testing.assert_array_equal(one.t, t)
 
 
 def test_additional_columns_are_left_out_and_named(tmp_path):
