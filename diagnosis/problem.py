@@ -43,6 +43,8 @@ ABOVE, SHARE = 30.0, 3e-3
 FARTHER, MOST_FREQUENCIES = 6.0, 900
 # Noise is at least this share of the swing: no instrument shows less, and motions are not computed more accurately.
 FINEST = 1e-6
+# Of a sensor that moves less than this share of what the liveliest does, the rate of change is not looked at.
+MOVES = 0.1
 # A stretch that lasts so many times as long as its samples ask for holds a gap.
 GAP = 2.0
 # In typical times between readings; each is some steps of the integrator.
@@ -216,6 +218,21 @@ class Problem:
     def top(self) -> float:
         """The highest angular frequency that the readings plainly show."""
         return _top(self.spectrum, max(self.data, key=lambda one: len(one.t)))
+
+    @functools.cached_property
+    def fastest(self) -> float:
+        """The highest angular frequency, or a faster rate of change: what relaxes has no peak in the spectrum.
+
+        The rate of a sensor is the root mean square of its slope over its standard deviation, about the frequency of a
+        sine; sensors that move little are left out.
+        """
+        found = self.top
+        for record, nodes in zip(self.records, self.nodes, strict=True):
+            u = nodes[:, : self.plain.parts * self.plain.count]
+            size, slope = np.nanstd(u, axis=0), np.sqrt(np.nanmean(np.gradient(u, record.times, axis=0) ** 2, axis=0))
+            moving = size > MOVES * np.nanmax(size)
+            found = max(found, float(np.max(slope[moving] / size[moving], initial=0.0)))
+        return found
 
     @property
     def main(self) -> float:

@@ -38,7 +38,8 @@ EQUAL = 3.0
 # frequency: on shorter ones they stand in for whatever is missing. Where a sensor shows plainly that something is
 # still missing, or where no model can be followed further, they are looked for at once.
 PERIODS = 3.0
-# Horizons begin at this share of the shortest period, where a wrong equation can follow, too.
+# Horizons begin at this share of the shortest period, or of 2 pi over the fastest rate of change if that is less, where
+# a wrong equation can follow, too.
 FIRST_HORIZON = 0.5
 # Where the declared equation leaves less than so many times the noise of whole recordings, the search begins there:
 # what is missing is weak, and short horizons would only offer stand-ins.

@@ -84,7 +84,7 @@ class Search:
         done: tuple[Horizon, ...] = ()
         last: Found | None = None
         stuck = opened = False
-        shortest = 2 * np.pi / self.problem.top / self.problem.step
+        shortest = 2 * np.pi / self.problem.fastest / self.problem.step
         length = max(int(rules.FIRST_HORIZON * shortest), self._least)
         carried = self._first(length)
         if longer := self._at_once(carried):

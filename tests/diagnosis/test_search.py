@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from latticebench import systems
+from latticebench.bench.trials.trial import Trial
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
@@ -46,3 +50,25 @@ def test_a_strong_force_below_the_motions_own_frequency_is_named(driven):
     assert force.name == "drive"
     assert force.placed.frequency == pytest.approx(0.6, abs=0.001)
     assert "damping" in (friction.name, *friction.alternatives)
+
+
+@pytest.mark.parametrize("omega", [0.7, 3.0])
+def test_the_fastest_motion_of_a_spring_is_its_own_and_of_what_relaxes_its_rate(omega, driven):
+    t = np.linspace(0, 40, 400)
+    noise = 1e-4 * np.random.default_rng(6).normal(size=(400, 1))
+    swing, decay = (replace(driven, t=t, u=u[:, None] + noise) for u in (np.cos(omega * t), np.exp(-omega * t)))
+    problem = Problem.of(SPRING, 2, [swing], CATALOGUE)
+    assert problem.fastest == pytest.approx(problem.top) == pytest.approx(omega, rel=0.05)
+    problem = Problem.of(SPRING, 1, [decay], CATALOGUE)
+    # The root mean square of the slope is sqrt(omega / 2 span), the deviation nearly sqrt(1 / 2 omega span).
+    assert problem.fastest == pytest.approx(omega, rel=0.2)
+    assert problem.top < 0.7 * omega
+
+
+@pytest.mark.slow
+def test_other_ends_than_those_declared_are_found_in_a_chain_that_relaxes():
+    system, trial = systems.find("ginzburg-landau"), Trial(system="ginzburg-landau", effect="ends", z=5, seed=80)
+    samples = replace(trial.recording(system).samples, ends=system.ends)
+    found = diagnose(system.library("equation"), 1, [samples], CATALOGUE)
+    assert [one.name for one in found.findings] == ["ends"]
+    assert found.verdict == "explained"
