@@ -16,6 +16,7 @@ from latticebench.bench.paired import UNDECIDED
 from latticebench.bench.publish import format_number
 from latticebench.bench.tables import read_cases
 from latticebench.bench.trials.laboratory.tables import nothing_missing
+from latticebench.bench.trials.laboratory.tables import share as shares
 from latticebench.methods.engine.integrated_equation import PRICE, SPAN
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -94,6 +95,25 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     exact = share(every["right"])
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
     assert f"{exact.split(' (')[0]} of {exact.split()[-1]} laboratory recordings" in readme
+
+
+def test_the_page_on_the_diagnosis_says_what_the_tables_of_short_recordings_say() -> None:
+    loop, pairs = (pd.read_csv(RESULTS / name / "trials.csv", comment="#") for name in ("loop", "loop/pairs"))
+    loop, pairs = (frame[frame["status"] == "ok"] for frame in (loop, pairs))
+    nameless = loop["effect"].str.startswith("other: ")
+    alone = ~nameless & (loop["effect"] != "none") & ~loop["effect"].str.contains("+", regex=False)
+    for row, some in (
+        ("one effect of 10 to 100 standard deviations | it is named", loop[alone & (loop["z"] >= 10)]),
+        ("one effect of 5 standard deviations | it is named", loop[alone & (loop["z"] == 5)]),
+        ("two effects of 20 standard deviations | both are named", pairs),
+        (
+            "one effect without a name, 5 or more from all that have one | the verdict says that something is left",
+            loop[nameless & (loop["apart"] >= 5)],
+        ),
+        ("one effect without a name, nearer to one that has | the same", loop[nameless & (loop["apart"] < 5)]),
+        ("nothing missing | no effect named", loop[loop["effect"] == "none"]),
+    ):
+        assert f"| short, {row} | {share(shares(some['right']))} |" in words("diagnosis"), row
 
 
 def test_the_page_on_the_diagnosis_says_what_the_table_of_recordings_that_lack_nothing_says() -> None:
