@@ -79,6 +79,9 @@ def test_the_page_on_the_limit_says_what_the_table_of_efficiencies_says(script: 
             assert f"`{method}` {counts.ends(group['efficiency'])}" in text, (part, method)
 
 
+NAMED = "every effect named, alone or in its group, and no other"
+
+
 def share(text: str, digits: int = 0) -> str:
     """Return a share such as "97.4 (92.6-99.1) of 115" as the page has it."""
     found = re.fullmatch(r"(\S+) \((\S+)-(\S+)\) of (\d+)", text)
@@ -92,6 +95,8 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     every = summary[summary["by"] == "all"].iloc[0]
     for column in ("right", "residual at most 1.3", "intervals that hold", "forecast worse"):
         assert f"| {share(every[column])} |" in words("diagnosis"), column
+    classic = pd.read_csv(RESULTS / "loop" / "classic" / "summary.csv", comment="#", dtype=str)
+    assert f"among two or three effects | {NAMED} | {share(classic['right'].iloc[0])} |" in words("diagnosis")
     exact = share(every["right"])
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
     assert f"{exact.split(' (')[0]} of {exact.split()[-1]} laboratory recordings" in readme
