@@ -43,8 +43,6 @@ ABOVE, SHARE = 30.0, 3e-3
 FARTHER, MOST_FREQUENCIES = 6.0, 900
 # Noise is at least this share of the swing: no instrument shows less, and motions are not computed more accurately.
 FINEST = 1e-6
-# Of a sensor that moves less than this share of what the liveliest does, the rate of change is not looked at.
-MOVES = 0.1
 # A stretch that lasts so many times as long as its samples ask for holds a gap.
 GAP = 2.0
 # In typical times between readings; each is some steps of the integrator.
@@ -230,7 +228,7 @@ class Problem:
         for record, nodes in zip(self.records, self.nodes, strict=True):
             u = nodes[:, : self.plain.parts * self.plain.count]
             size, slope = np.nanstd(u, axis=0), np.sqrt(np.nanmean(np.gradient(u, record.times, axis=0) ** 2, axis=0))
-            moving = size > MOVES * np.nanmax(size)
+            moving = size > rules.MOVES * np.nanmax(size)
             found = max(found, float(np.max(slope[moving] / size[moving], initial=0.0)))
         return found
 

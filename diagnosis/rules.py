@@ -41,6 +41,9 @@ PERIODS = 3.0
 # Horizons begin at this share of the shortest period, or of 2 pi over the fastest rate of change if that is less, where
 # a wrong equation can follow, too.
 FIRST_HORIZON = 0.5
+# A sensor's rate of change counts there if it swings by at least this share of what the liveliest one does: smoothed
+# noise of a sensor at rest changes fast.
+MOVES = 0.1
 # Where the declared equation leaves less than so many times the noise of whole recordings, the search begins there:
 # what is missing is weak, and short horizons would only offer stand-ins.
 AT_ONCE = 1.5

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.methods.engine.regression import Regression, folded
+from latticebench.methods.engine.regression import Regression, folded, joined, triangular
 from latticebench.methods.engine.scaled import Scaled
 from latticebench.methods.engine.weak_covariance import Sweep
 from latticebench.methods.engine.weak_form import ACCURACY, WeakForm
@@ -35,6 +35,8 @@ ROUNDS = 20
 # Draws of the noise for total least squares, and the mean square residual above which it is used.
 DRAWS = 10
 SUSPECT = 1.5
+# Estimates are as good as each other where the logarithms of their mean square residuals differ by no more than this.
+ALIKE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +101,11 @@ def estimate(
     if second is None:
         return found
     other = _iterate(forms, support, rounds, second, seen)
-    return max(found, other, key=lambda one: (one.settled, -abs(np.log(max(one.chi2, 1e-300)))))
+    if other.settled != found.settled:
+        return other if other.settled else found
+    # Both may have come to the same: rounding must not choose.
+    first, last = (abs(np.log(max(one.chi2, 1e-300))) for one in (found, other))
+    return other if last < first - ALIKE else found
 
 
 def _iterate(
@@ -133,38 +139,39 @@ def _iterate(
 def _total(forms: Sequence[WeakForm], support: ndarray, seed: int) -> ndarray | None:
     """Return the coefficients by total least squares; None where it has no finite solution.
 
-    Noise in the terms pulls ordinary least squares towards zero, but not total least squares, which makes [A,
-    y] (xi, -1) small against the contribution of the noise: the least generalised eigenvalue of the two
-    matrices of sums of squares. That of the noise is taken from a few draws (Van Huffel & Vandewalle, The Total
-    Least Squares Problem, SIAM 1991, chapter 8).
+    Noise in the terms pulls ordinary least squares towards zero, but not total least squares, which makes [A, y] (xi,
+    -1) small against the contribution of the noise, taken from a few draws (Van Huffel & Vandewalle, The Total Least
+    Squares Problem, SIAM 1991, chapter 8). With the triangular factors R of [A, y] and N of its changes by noise, that
+    is R^-1 z, where z is the right singular vector of N R^-1 that belongs to the largest singular value. Sums of
+    squares would square the conditioning.
     """
-    import scipy.linalg
-
     draw = np.random.default_rng(seed)
-    columns = np.append(np.flatnonzero(support), len(support))
-    gram, noise = np.zeros((2, len(columns), len(columns)))
+    changes: Regression | None = None
     for form in forms:
-        for rows in form.pieces(form.state.seen):
-            gram += rows[:, columns].T @ rows[:, columns]
         noisy = empty(form.state.seen.shape)
         for _ in range(DRAWS):
             for some in rows_of(noisy):
                 noisy[some] = form.state.seen[some] + draw.normal(size=noisy[some].shape)
             for rows, other in zip(form.pieces(form.state.seen), form.pieces(noisy), strict=True):
-                change = (other - rows)[:, columns]
-                noise += change.T @ change / DRAWS
-    scale = np.sqrt(np.diag(gram))
-    scale = np.where(scale > 0, scale, 1.0)
-    across = np.outer(scale, scale)
-    try:
-        _, modes = scipy.linalg.eigh(gram / across, noise / across, subset_by_index=[0, 0])
-    except (np.linalg.LinAlgError, ValueError):
+                changes = joined(changes, Regression((other - rows)[:, :-1][:, support], (other - rows)[:, -1]))
+    assert changes is not None
+    pieces = (
+        Regression(rows[:, :-1][:, support], rows[:, -1]) for form in forms for rows in form.pieces(form.state.seen)
+    )
+    factor, noise = (np.column_stack([one.design, one.target]) for one in map(triangular, (folded(pieces), changes)))
+    if len(factor) < factor.shape[1]:
         return None
-    least = modes[:, 0] / scale
-    if abs(modes[-1, 0]) < 1e-6 * np.max(np.abs(modes)):
+    scale = np.linalg.norm(factor, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    try:
+        modes = np.linalg.svd(np.linalg.solve((factor / scale).T, (noise / scale).T).T)[2]
+        least = np.linalg.solve(factor / scale, modes[0])
+    except np.linalg.LinAlgError:
+        return None
+    if not abs(least[-1]) >= 1e-6 * np.max(np.abs(least)):
         return None
     full = np.zeros(len(support))
-    full[columns[:-1]] = -least[:-1] / least[-1]
+    full[support] = -least[:-1] / scale[:-1] / (least[-1] / scale[-1])
     return full
 
 

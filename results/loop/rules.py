@@ -1,11 +1,11 @@
 """Show what each rule of the diagnosis buys: rules.csv and rules.md.
 
-    python results/loop/rules.py [JOBS [FOLDER [RULE ...]]]
+    python results/loop/rules.py [JOBS [FOLDER [NAME ...]]]
 
 Each number of `diagnosis/rules.py` is switched off, halved and doubled, one at a time. The same recordings are
 diagnosed every time, so that a rule is judged by the recordings whose answer it changes. What rules.csv already has is
-not computed again. FOLDER has the measured recordings; without it they are left out. Only the rules that are named are
-tried, or else all.
+not computed again. FOLDER has the measured recordings; without it, or with "", they are left out. Only the rules and
+the kinds of recordings that are named are tried, or else all.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ NEVER, ALWAYS = 0.0, 1e9
 OFF: Mapping[str, Any] = {
     "FALSE_ALARM": 1.0, "FALSE_DOUBT": NEVER, "NAMED": NEVER, "STAND_IN": NEVER,
     "FEW_AROUND": ALWAYS, "CROWDED": 0.5, "STRETCHES": 1, "RIVALS": 1, "TRIED": 1, "UNDERSTATED": 1.0,
-    "MOST_EFFECTS": 100, "EQUAL": NEVER, "PERIODS": NEVER, "FIRST_HORIZON": 1e6, "AT_ONCE": NEVER,
-    "FASTER": rules.GROWTH, "ALMOST": 1.0, "BORDER": 1e6, "LOST": ALWAYS, "FOLLOWED": NEVER, "SHARE": NEVER,
-    "SHARE_TIMED": NEVER, "REPELLING": NEVER, "WORSE": ALWAYS, "BEYOND_NOISE": NEVER,
+    "MOST_EFFECTS": 100, "EQUAL": NEVER, "PERIODS": NEVER, "FIRST_HORIZON": 1e6, "MOVES": ALWAYS,
+    "AT_ONCE": NEVER, "FASTER": rules.GROWTH, "ALMOST": 1.0, "BORDER": 1e6, "LOST": ALWAYS, "FOLLOWED": NEVER,
+    "SHARE": NEVER, "SHARE_TIMED": NEVER, "REPELLING": NEVER, "WORSE": ALWAYS, "BEYOND_NOISE": NEVER,
 }  # fmt: skip
 # Numbers that only mean something as they are, or that are gone with another one.
 NEITHER = {"STAND_INS"}
@@ -56,15 +56,23 @@ KINDS_OF_RECORDINGS = {
     "missing": "laboratory recordings of one to three sites, something missing: every effect is named and no other",
     "nothing": "such recordings with nothing missing: nothing is named, and the verdict is not `unexplained`",
     "unnamed": "short recordings of 25 sites with an effect that has no name: the verdict says that something is left",
+    "relaxing": "short recordings of a Ginzburg-Landau lattice of 25 sites, one effect missing: it alone is named",
     "measured": "measured recordings: the effects that are known to be there are named, and the forecast is not worse",
 }
 # Seeds that nothing else uses.
-SEEDS = {"missing": range(31000, 31040), "nothing": range(32000, 32040), "unnamed": (33001,)}
+SEEDS = {
+    "missing": range(31000, 31040),
+    "nothing": range(32000, 32040),
+    "unnamed": (33001,),
+    "relaxing": (34001, 34002),
+}
 SITES = (1, 2, 3)
 # Of so many laboratory recordings in a row so many are kept: those that take least time.
 OF, KEPT = 5, 3
 # Of the fifth blind set's effects every so many is taken.
 EVERY = 3
+# What is missing in lattices that relax.
+MISSING = ("ends", "onsite-quadratic", "gradient", "next-neighbour", "defect", "sensor-gain", "drive", "kick")
 # What is known to be in the measured recordings that take least time; of several effects joined by / one is enough.
 THERE = {
     "gliders": ["sensor-offset", "unequal-masses", "damping/quadratic-drag/dry-friction"],
@@ -101,6 +109,11 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
     for seed in SEEDS["unnamed"]:
         trials = [(name, Trial(system="phi4", effect=name, z=30.0, seed=seed)) for name in [*FIFTH_BLIND][::EVERY]]
         found += [("unnamed", f"{name} {seed}", trial) for name, trial in trials]
+    found += [
+        ("relaxing", f"{name} {seed}", Trial(system="ginzburg-landau", effect=name, z=30.0, seed=seed))
+        for seed in SEEDS["relaxing"]
+        for name in MISSING
+    ]
     measured = [] if folder is None else suite.load("measured", folder).cases
     found += [("measured", one.name, one) for one in measured if isinstance(one, Measured) and one.name in THERE]
     return found
@@ -112,9 +125,10 @@ def judged(kind: str, name: str, result: Mapping[str, Any]) -> dict[str, Any]:
         row = laboratory.table([result]).iloc[0]
         right = row["right"] and not (kind == "nothing" and row["verdict"] == "unexplained")
         return {"truth": row["truth"], "verdict": row["verdict"], "named": row["named"], "right": right}
-    if kind == "unnamed":
+    if kind in ("unnamed", "relaxing"):
         row = scores.table([result]).iloc[0]
-        return {"truth": row["effect"], "verdict": row["verdict"], "named": row["named"], "right": bool(row["right"])}
+        right = bool(row["right"]) and (kind == "unnamed" or row["extra"] == 0)
+        return {"truth": row["effect"], "verdict": row["verdict"], "named": row["named"], "right": right}
     found = recorded.summarised(result["report"])
     effects = [] if result["report"] is None else result["report"]["effects"]
     named = {one for effect in effects for one in (effect["effect"], *effect["indistinguishable"])}
@@ -168,15 +182,17 @@ def short(rows: pd.DataFrame, every: Sequence[tuple[str, str, Case]]) -> set[tup
 def compute(jobs: int, folder: Path | None, only: Sequence[str]) -> pd.DataFrame:
     """Diagnose whatever is not yet known, and keep each answer as it comes."""
     rows, every = known(), recordings(folder)
+    kinds = set(only) & set(KINDS_OF_RECORDINGS) or set(KINDS_OF_RECORDINGS)
+    names = set(only) - kinds
     for rule, value, changed in variants():
-        if only and rule not in (AS_IS, *only):
+        if names and rule not in (AS_IS, *names):
             continue
         here = rows[(rows["rule"] == rule) & (rows["value"] == value)]
         have = set(zip(here["kind"], here["recording"], strict=True))
         asked = {(kind, name) for kind, name, _ in every} if rule == AS_IS else short(rows, every)
         if value in ("half", "double"):
-            asked = {(kind, name) for kind, name in asked if kind in ("missing", "nothing")}
-        work = [one for one in every if one[:2] in asked - have]
+            asked = {(kind, name) for kind, name in asked if kind in ("missing", "nothing", "relaxing")}
+        work = [one for one in every if one[0] in kinds and one[:2] in asked - have]
         with ProcessPoolExecutor(jobs) as pool:
             for one in as_completed([pool.submit(diagnosed, rule, value, changed, case, folder) for case in work]):
                 row = pd.DataFrame([one.result()])
@@ -242,5 +258,5 @@ def write(rows: pd.DataFrame) -> None:
 
 
 if __name__ == "__main__":
-    place = Path(sys.argv[2]) if sys.argv[2:] else None
+    place = None if sys.argv[2:3] in ([], [""]) else Path(sys.argv[2])
     write(compute(int(sys.argv[1]) if sys.argv[1:] else 1, place, sys.argv[3:]))

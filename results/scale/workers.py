@@ -1,4 +1,4 @@
-"""Measure what running cases costs beside the cases themselves, by executor and number of workers.
+"""Measure what running cases costs beyond the cases themselves, by executor and number of workers.
 
     python results/scale/workers.py [SHARE]
 
@@ -18,13 +18,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from datetime import date
+from collections.abc import Mapping
 from pathlib import Path
 
 import pandas as pd
 
 from latticebench.bench.executors.batches import LONGEST, SHARE
-from latticebench.bench.provenance import commit, machine, origin
+from latticebench.bench.provenance import lines, origin
+from latticebench.bench.publish import markdown_list, markdown_table, render
 from latticebench.bench.store import create
 from latticebench.bench.suite import load
 from latticebench.bench.worker import attempt
@@ -125,14 +126,14 @@ def measured(share: float) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def page(table: pd.DataFrame) -> str:
-    """Return the text of workers.md."""
+def page(table: pd.DataFrame, rates: Mapping[str, float]) -> str:
+    """Return the text of workers.md, without its provenance."""
     kind = table["executor"].str.split(",").str[0]
     by_one = table.groupby(["method", kind], sort=False)["seconds"].transform("first")
     efficiency = (100 * by_one / (2 * table["seconds"])).where(table["executor"].str.endswith("2 workers"))
     shown = table.assign(efficiency=[f"{value:.0f} %" if value == value else "" for value in efficiency])
     shown = shown.rename(columns={"alone_ms": "ms a case alone", "overhead_ms": "ms a case besides"})
-    tasks, kept = tasks_a_second(), kept_a_second()
+    tasks, kept = rates["tasks"], rates["results"]
     saturated = pd.DataFrame([
         {
             "a case takes": text, "the scheduler, one case a task": f"{tasks * seconds:,.0f}",
@@ -141,28 +142,28 @@ def page(table: pd.DataFrame) -> str:
         }
         for text, seconds in (("1 ms", 1e-3), ("100 ms", 0.1), ("10 s", 10.0))
     ])  # fmt: skip
-    return "\n".join([
-        "# What running cases costs beside them\n",
-        (__doc__ or "").split("workers.md.\n")[1].strip() + "\n",
-        shown.to_markdown(index=False, floatfmt=".4g") + "\n",
-        "## How many workers saturate a scheduler, on paper\n",
+    return "\n\n".join([
+        "# What running cases costs beyond the cases themselves", (__doc__ or "").split("workers.md.\n")[1].strip(),
+        markdown_table(shown.astype(str)),
+        "## How many workers a scheduler can keep busy, on paper",
         f"A scheduler, its client and one worker, all on this machine, got {tasks:.0f} empty tasks a second done. The "
         f"client's store kept {kept:.0f} results a second. A batch of cases is one task; it grows until messages take "
-        f"{SHARE:.0%} of a worker's time, at most to {LONGEST:g} s. From these figures, so many workers keep busy\n",
-        saturated.to_markdown(index=False) + "\n",
+        f"{SHARE:.0%} of a worker's time, at most to {LONGEST:g} s. By these figures each keeps so many workers busy:",
+        markdown_table(saturated),
     ])  # fmt: skip
 
 
-def made() -> list[str]:
-    """Return the lines that say what made the table."""
-    return [
-        f"command: python results/scale/workers.py{''.join(f' {one}' for one in sys.argv[1:])}", f"commit: {commit()}",
-        f"date: {date.today()}", f"machine: {machine()}",
-    ]  # fmt: skip
+def main() -> None:
+    """Measure, and write the two files."""
+    share = float(sys.argv[1]) if len(sys.argv) > 1 else 1.0
+    costs, rates = measured(share), {"tasks": tasks_a_second(), "results": kept_a_second()}
+    command = " ".join(["python results/scale/workers.py", *sys.argv[1:]])
+    counts = {f"{name} a second": f"{rate:.0f}" for name, rate in rates.items()}
+    about = {"command": command, **origin(), **counts, "seeds": "from 1 on, one a case"}
+    write_text(HERE / "workers.csv", render(costs, about, "csv"))
+    provenance = "".join(f"{line}\n" for line in markdown_list(lines(about)))
+    write_text(HERE / "workers.md", f"{page(costs, rates)}\n\n{provenance}")
 
 
 if __name__ == "__main__":
-    costs = measured(float(sys.argv[1]) if len(sys.argv) > 1 else 1.0)
-    lines = made()
-    write_text(HERE / "workers.csv", "".join(f"# {line}\n" for line in lines) + costs.to_csv(index=False))
-    write_text(HERE / "workers.md", page(costs) + "\n" + "".join(f"- {line}\n" for line in lines))
+    main()
