@@ -33,6 +33,8 @@ from latticebench.systems.files import write_text
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 ROOMS = ("systems", "methods", "diagnosis", "bench")
+# What every method is asked.
+CONTRACT = "methods/test_contract.py"
 # Modules, with the tests that are nearest and those that are near.
 MODULES = {
     "bench/score.py": ("bench/test_score.py", "bench/test_fitting.py bench/test_run.py"),
@@ -43,7 +45,31 @@ MODULES = {
     "systems/terms.py": ("systems/test_terms.py", "systems/test_systems.py systems/test_parser.py"),
     "systems/stencil.py": ("systems/test_stencil.py systems/test_motion.py", "systems/test_systems.py"),
     "systems/simulate.py": ("systems/test_simulate.py systems/test_observe.py", "systems/test_motion.py"),
-}
+    "methods/engine/derivatives.py": ("methods/engine/test_derivatives.py methods/test_sindy.py", CONTRACT),
+    "methods/engine/regression.py": ("methods/test_sindy.py methods/test_streaming.py", CONTRACT),
+    "methods/sindy_tuned.py": ("methods/test_sindy_tuned.py", CONTRACT),
+    "methods/e_sindy.py": ("methods/test_e_sindy.py", CONTRACT),
+    "methods/engine/weak_form.py": ("methods/engine/test_weak_form.py methods/test_weak.py", CONTRACT),
+    "methods/engine/errors_in_variables.py": (
+        "methods/engine/test_errors_in_variables.py methods/test_weak.py", CONTRACT),
+    "methods/weak_stlsq.py": ("methods/test_weak_stlsq.py", CONTRACT),
+    "methods/engine/sensitivity.py": (
+        "methods/engine/test_sensitivity.py methods/engine/test_shooting.py", f"methods/test_trajectory.py {CONTRACT}"),
+    "methods/engine/shooting.py": (
+        "methods/engine/test_shooting.py methods/test_trajectory.py", f"bench/test_limit.py {CONTRACT}"),
+    "methods/trajectory.py": ("methods/test_trajectory.py", CONTRACT),
+    "methods/engine/collocation.py": (
+        "methods/engine/test_collocation.py methods/engine/test_spline_state.py",
+        f"methods/test_splines.py methods/test_pielm.py {CONTRACT}"),
+    "methods/splines.py": ("methods/test_splines.py", CONTRACT),
+    "methods/engine/networks/descent.py": ("methods/engine/networks/test_descent.py methods/test_pinn.py", CONTRACT),
+    "methods/engine/networks/loss.py": ("methods/engine/networks/test_loss.py methods/test_pinn.py", CONTRACT),
+    "methods/pinn.py": ("methods/test_pinn.py", CONTRACT),
+    "methods/pielm.py": ("methods/test_pielm.py", CONTRACT),
+    "methods/engine/networks/projection.py": (
+        "methods/engine/networks/test_projection.py methods/test_pielm.py", f"methods/test_pinn_gn.py {CONTRACT}"),
+    "methods/pinn_gn.py": ("methods/test_pinn_gn.py", CONTRACT),
+}  # fmt: skip
 LIMIT = 600.0
 SEED = 1
 
