@@ -100,25 +100,24 @@ def drawn(module: str, count: int) -> list[Any]:
     return [every[place] for place in sorted(chosen)]
 
 
-def tried(count: int) -> Iterator[tuple[Any, ...]]:
-    """Try the mutants of each module; the working folder is the copy."""
+def tried(module: str, count: int) -> Iterator[tuple[Any, ...]]:
+    """Try the mutants of a module; the working folder is the copy."""
     from cosmic_ray.mutating import mutate_and_test
     from cosmic_ray.work_item import TestOutcome
 
-    for module, stages in MODULES.items():
-        for mutation in drawn(module, count):
-            by, line = "", ""
-            for stage, tests in zip(("nearest", "near"), stages, strict=True):
-                files = " ".join(f"tests/{name}" for name in tests.split())
-                command = f"{shlex.quote(sys.executable)} -m pytest -x -q --benchmark-disable -m 'not slow' {files}"
-                result = mutate_and_test([mutation], f"{command} -p no:cacheprovider -p no:randomly", LIMIT)
-                line = next((one[1:].strip() for one in (result.diff or "").splitlines()[4:] if one[:1] == "+"), "")
-                if result.test_outcome != TestOutcome.SURVIVED:
-                    by = stage
-                    break
-            row = (module, mutation.start_pos[0], mutation.operator_name.partition("/")[2], by or "survived", line)
-            print(*row, flush=True)
-            yield row
+    for mutation in drawn(module, count):
+        by, line = "", ""
+        for stage, tests in zip(("nearest", "near"), MODULES[module], strict=True):
+            files = " ".join(f"tests/{name}" for name in tests.split())
+            command = f"{shlex.quote(sys.executable)} -m pytest -x -q --benchmark-disable -m 'not slow' {files}"
+            result = mutate_and_test([mutation], f"{command} -p no:cacheprovider -p no:randomly", LIMIT)
+            line = next((one[1:].strip() for one in (result.diff or "").splitlines()[4:] if one[:1] == "+"), "")
+            if result.test_outcome != TestOutcome.SURVIVED:
+                by = stage
+                break
+        row = (module, mutation.start_pos[0], mutation.operator_name.partition("/")[2], by or "survived", line)
+        print(*row, flush=True)
+        yield row
 
 
 def intervals(noticed: int, count: int) -> str:
@@ -151,18 +150,21 @@ def page() -> str:
 
 
 def main() -> None:
-    """Try the mutants and write the two files."""
+    """Try the mutants, and write the two files after each module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=10, help="mutants per module; 0 for all")
     given = parser.parse_args()
     about = {"command": f"python results/mutants/mutants.py --count {given.count}", **origin(), "seed": SEED}
+    rows: list[tuple[Any, ...]] = []
     with tempfile.TemporaryDirectory() as folder:
-        os.chdir(copied(Path(folder).resolve()))
-        rows = list(tried(given.count))
-        os.chdir(ROOT)
-    table = pd.DataFrame(rows, columns=["module", "line", "operator", "noticed by", "changed to"])
-    write_text(HERE / "mutants.csv", render(table, about, "csv"))
-    write_text(HERE / "mutants.md", page())
+        copy = copied(Path(folder).resolve())
+        for module in MODULES:
+            os.chdir(copy)
+            rows += tried(module, given.count)
+            os.chdir(ROOT)
+            table = pd.DataFrame(rows, columns=["module", "line", "operator", "noticed by", "changed to"])
+            write_text(HERE / "mutants.csv", render(table, about, "csv"))
+            write_text(HERE / "mutants.md", page())
 
 
 if __name__ == "__main__":
