@@ -238,16 +238,20 @@ class Search:
     ) -> Fitted | None:
         """Return the fit of a model; None where it cannot be followed or comes to no cost below `hope`.
 
-        Dry friction is made more abrupt from fit to fit, as long as that helps.
+        Dry friction is made more abrupt from fit to fit, as long as that helps; where the fit that this one starts from
+        has been through that, it has to come below `hope` before.
         """
         if not model.rubs:
             return self._refit(model, layout, near, start, steps, hope)
-        soft = self.problem.plain.rest
-        known = start.layout.plain.rest if start is not None and start.model.rubs else soft
+        known = soft = self.problem.plain.rest
+        least = np.inf
+        if start is not None and start.model.rubs:
+            known, least = start.layout.plain.rest, hope
         found = None
         for rest in sorted({known, soft}):
-            resting = layout.resting(rest).with_substeps(model, near, self.problem.top)
-            found = found or self._refit(model, resting, near, start, steps)
+            if found is None:
+                resting = layout.resting(rest).with_substeps(model, near, self.problem.top)
+                found = self._refit(model, resting, near, start, steps, least)
         while found is not None and found.layout.plain.rest > ABRUPT * soft:
             resting = found.layout.resting(found.layout.plain.rest / SHARPER)
             resting = resting.with_substeps(found.model, found.followed.nodes, self.problem.top)
