@@ -49,7 +49,7 @@ class Regression:
     @property
     def height(self) -> float:
         """RMS of y."""
-        return float(np.sqrt(np.mean(self.target**2) * (len(self.target) / self.size)))
+        return float(_rms(self.target) * np.sqrt(len(self.target) / self.size))
 
     @property
     def status(self) -> str:
@@ -65,8 +65,7 @@ class Regression:
     @property
     def scales(self) -> Float[ndarray, " terms"]:
         """RMS of each column of A over that of y (terms,): xi * scales are the terms' shares of y; 1 where it is 0."""
-        columns = np.sqrt(np.mean(self.design**2, axis=0) * (len(self.target) / self.size))
-        scale = columns / (self.height or 1.0)
+        scale = _rms(self.design) * np.sqrt(len(self.target) / self.size) / (self.height or 1.0)
         return np.where(scale > 0, scale, 1.0)
 
     def residual(self, coefficients: Float[ndarray, " terms"]) -> float:
@@ -88,6 +87,13 @@ class Regression:
             scale = self.scales[chosen]
             coefficients[chosen] = lstsq(self.design[:, chosen], self.target, rcond=1e-14, scale=scale)
         return coefficients
+
+
+def _rms(values: ndarray) -> ndarray:
+    """Return the RMS along the first axis; a power of 2 is taken out, so that no square overflows."""
+    _, exponent = np.frexp(np.max(np.abs(values), axis=0, initial=0.0))
+    unit = np.ldexp(1.0, exponent - 1)
+    return np.asarray(unit * np.sqrt(np.mean((values / unit) ** 2, axis=0)))
 
 
 def triangular(regression: Regression) -> Regression:

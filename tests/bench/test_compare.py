@@ -135,3 +135,17 @@ def test_what_is_no_published_table_is_one_clear_line(tmp_path: Path, text: str)
         read_run(tmp_path / "some.csv")
     with pytest.raises(InputError, match="no results"):
         read_run(tmp_path / "none")
+
+
+LABORATORY = "# command: latticebench run laboratory\nasked,seed,status,right,residual_after\n"
+
+
+def test_a_laboratory_recording_is_worse_when_it_was_right_and_is_wrong(tmp_path: Path) -> None:
+    for name, rights in (("old", ("True", "False", "True")), ("new", ("False", "True", "True"))):
+        (tmp_path / name).mkdir()
+        rows = "".join(f"all kinds,{seed},ok,{right},1.0\n" for seed, right in enumerate(rights))
+        (tmp_path / name / "laboratory.csv").write_text(LABORATORY + rows)
+    found = compare(read_run(tmp_path / "old"), read_run(tmp_path / "new"))
+    assert list(found.worse["case"]) == ["laboratory all kinds | seed 0"]
+    assert list(found.better["case"]) == ["laboratory all kinds | seed 1"]
+    assert found.same == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pydantic
 import pytest
 
 from latticebench.bench import fitting
@@ -74,3 +75,13 @@ def test_the_cutoff_of_the_support_follows_from_the_equation() -> None:
     assert score(np.array([1.0, 0.019, 0.0]), truth, shares).exact
     assert score(np.array([1.0, 0.009, 0.0]), truth, shares).tpr == 0.5
     assert score(np.array([1.0, 0.02, 0.02]), truth, shares).tpr == pytest.approx(2 / 3)
+
+
+def test_a_case_is_known_by_its_settings_in_whatever_order_and_has_two_minutes_and_four_gibibytes() -> None:
+    given = {"method": "stlsq", "settings": {"threshold": 0.1, "alpha": 0.5}, "parameters": {"C": 1.0, "v": 0.5}}
+    other = {name: dict(reversed(one.items())) if isinstance(one, dict) else one for name, one in given.items()}
+    assert case(**given).identity == case(**other).identity != case(method="stlsq").identity
+    assert (case().time_limit, case().memory_limit) == (120.0, 4096)
+    for wrong in ({"time_limit": 0.0}, {"memory_limit": 0}, {"memory_limit": 2**40}):
+        with pytest.raises(pydantic.ValidationError):
+            case(**wrong)

@@ -117,6 +117,9 @@ def test_verdicts_tell_known_coefficients_from_sums():
     assert limit.groups == ((0, 1),)
     assert limit.verdicts[0] == "only the sum of coefficients [u[n]] + [sin(u[n])] is known, to 0.22 %"
     assert limit.verdicts[2] == "known to 0.1 %"
+    # The standard error of a difference that is 0, in sizes of the derivative.
+    opposed = replace(limit, covariance=np.abs(covariance))
+    assert opposed.verdicts[0] == "only the sum of coefficients [u[n]] - [sin(u[n])] is known, to 0.45 %"
     alone = replace(limit, covariance=np.diag([1.0, 1e-6, 1e-6]))
     assert alone.verdicts[0] == "cannot be known from these samples"
 

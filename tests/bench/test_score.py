@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from latticebench import systems
-from latticebench.bench.score import forecast, score
-from latticebench.systems.motion import motion
+from latticebench.bench.score import LOST, forecast, score
+from latticebench.systems.lattice import library
+from latticebench.systems.motion import Motion, motion
+from latticebench.systems.samples import Samples
 from latticebench.systems.simulate import sample_times, simulate
+from latticebench.systems.terms import Term
 
 ONES = np.ones(4)
 
@@ -62,3 +65,17 @@ def test_a_wrong_equation_is_lost_early_and_one_that_explodes_has_an_infinite_er
     exploding = forecast(np.array([0.0, 0.0, 50.0, 50.0]), candidates, chain, start, exact)
     assert exploding.error == np.inf
     assert exploding.horizon < 3
+
+
+def test_the_error_and_the_horizon_of_a_forecast_are_those_of_two_cosines() -> None:
+    candidates = library("one", "u[n]")
+    chain = Motion(Term("-u[n]"), 2, False, 3, "fixed")
+    t = np.linspace(0, 20, 101)
+    amplitude = np.array([1.0, -2.0, 0.5])
+    exact = Samples(t, np.cos(t)[:, None] * amplitude, -np.sin(t)[:, None] * amplitude)
+    start = chain.pack(exact.u[0], np.zeros(3))
+    told = forecast(np.array([-(1.02**2)]), candidates, chain, start, exact)
+    off = np.cos(1.02 * t) - np.cos(t)
+    assert told.error == pytest.approx(np.linalg.norm(off) / np.linalg.norm(np.cos(t)), rel=1e-4)
+    first_lost = np.flatnonzero(np.abs(off) > LOST * np.sqrt(np.mean(np.cos(t) ** 2)))[0]
+    assert told.horizon == pytest.approx(t[first_lost - 1])

@@ -10,6 +10,7 @@ from latticebench.methods.engine.regression import Regression
 from latticebench.methods.engine.sparse import sparse_fit
 from latticebench.methods.method import make, solve
 from latticebench.systems.errors import InputError
+from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
 from latticebench.systems.simulate import simulate
 
@@ -93,3 +94,14 @@ def test_least_squares_on_a_quintic_spline_is_within_a_thousandth_and_the_oracle
     # Conditioning 40 to 75: rounding of the samples makes some 1e-14.
     assert error("oracle") <= 1e-12
     assert error("zero") == 1.0
+
+
+def test_rows_in_which_a_term_is_not_finite_are_left_out_and_said_so_only_if_none_is_left() -> None:
+    t = np.linspace(0.0, 3.0, 40)
+    u = np.column_stack([np.cos(t), 2 + np.sin(t)])
+    candidates = library("two", "u[n]; exp(400*u[n])")
+    # exp(710) overflows.
+    some = solve(make(methods.find("least-squares"), {}), [Samples(t, u, ends="free")], candidates, 2, seed=1)
+    assert np.all(np.isfinite(some.coefficients))
+    with pytest.raises(InputError, match="in every row a term of the library is not finite"):
+        solve(make(methods.find("least-squares"), {}), [Samples(t, u + 5, ends="free")], candidates, 2, seed=1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from latticebench import systems
+from latticebench.methods.engine import errors_in_variables
 from latticebench.methods.engine.errors_in_variables import estimate
 from latticebench.methods.engine.weak_form import WeakForm
 from latticebench.methods.method import Fit, make
@@ -273,3 +274,24 @@ def test_the_support_is_right_in_19_of_20_seeds(name: str, listed: str, noise: f
     found = [judge(Weak().fit([seen(name, noise, k)], terms, order, seed=0), truth) for k in range(20)]
     assert np.median([error for error, _ in found]) <= allowed
     assert sum(right for _, right in found) >= 19
+
+
+def test_a_complex_field_of_second_order_is_fitted_with_its_velocity() -> None:
+    # u'' = a u + b v with the roots -0.1 +- i.
+    t = np.linspace(0.0, 12.0, 241)
+    roots = np.array([-0.1 + 1j, -0.1 - 1j])
+    parts = np.array([[1.0, 0.3j], [0.5j, -0.8]])
+    u, v = (np.exp(np.outer(t, roots)) @ (roots[:, None] ** k * parts) for k in (0, 1))
+    given = Samples(t, u, v, ends="free")
+    found = make(Weak, {"optimizer": "none"}).fit([given], library("damped", "u[n]; v[n]"), 2, 0)
+    np.testing.assert_allclose(found.coefficients, [-1.01, -0.2], rtol=1e-4)
+
+
+def test_where_the_noise_explains_what_is_left_the_first_start_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError("total least squares was begun")
+
+    monkeypatch.setattr(errors_in_variables, "_total", never)
+    chosen, truth, order = candidates("phi4", "lib2")
+    fit = make(Weak, {}).fit([seen("phi4", 0.01)], chosen, order, 0)
+    assert judge(fit, truth)[0] < 0.02

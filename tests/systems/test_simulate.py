@@ -12,6 +12,7 @@ from latticebench import systems
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Initial, System
 from latticebench.systems.motion import motion
+from latticebench.systems.samples import Samples
 from latticebench.systems.simulate import (
     drift,
     follow,
@@ -330,6 +331,11 @@ def test_the_conserved_density_of_a_lattice_sums_to_its_energy_or_norm(name, end
     assert drift(system, {}, samples, ends) < 2e-11
     faster = replace(samples, u=samples.u * np.where(samples.t > 1, 1.001, 1.0)[:, None])
     assert drift(system, {}, faster, ends) > 1e-5
+
+
+def test_a_field_that_doubles_has_drifted_by_three_times_its_norm():
+    samples = Samples(np.array([0.0, 1.0, 2.0]), np.array([[1.0 + 1j, 2.0]] * 3) * np.array([[1.0], [2.0], [1.5]]))
+    assert drift(systems.find("dnls"), {}, samples, "fixed") == pytest.approx(3.0)
 
 
 def test_a_lattice_that_conserves_nothing_has_no_drift():

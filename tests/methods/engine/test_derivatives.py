@@ -98,3 +98,11 @@ def test_every_kind_of_the_derivative_package_is_known() -> None:
     from derivative.differentiation import methods
 
     assert set(KINDS) <= set(methods)
+
+
+def test_noise_is_smoothed_beside_gaps_as_elsewhere() -> None:
+    noisy = FIELD + 0.02 * np.random.default_rng(3).normal(size=FIELD.shape)
+    noisy[[7, 20, 21], 0] = np.nan
+    smooth, rough = (differentiate(T, noisy, kind) for kind in ("smoothing-spline", "spline"))
+    assert np.nanstd(smooth.second - SECOND) < 0.1 * np.nanstd(rough.second - SECOND)
+    np.testing.assert_allclose(rough.value, noisy, rtol=1e-12)
