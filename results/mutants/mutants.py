@@ -1,12 +1,14 @@
 """Change the code in one place at a time and see whether the tests notice: mutants.csv and mutants.md.
 
     make mutants
+    python results/mutants/mutants.py [--count N] [--again]
 
 Mutants come from cosmic-ray: an operator, a comparison, a number or a truth value is replaced, an exception or a
 decorator is another or none, a loop does not run. Of each module below as many are drawn as `--count` says, all if it
 is 0. Each is tried in a copy of the work tree on the quick tests that are nearest to its module, and if these let it
-pass, on those that are near. What survives is listed with the line that was changed. Replaced `|` are left out: they
-are in annotations, which nothing evaluates.
+pass, on those that are near. What survives is listed with the line that was changed. With `--again` those that survived
+before are tried again, as tests have come since; `commit` is that of the trial. Replaced `|` are left out: they are in
+annotations, which nothing evaluates.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +42,11 @@ MODULES = {
     "bench/score.py": ("bench/test_score.py", "bench/test_fitting.py bench/test_run.py"),
     "bench/case.py": ("bench/test_fitting.py bench/test_suite.py", "bench/test_store.py bench/test_run.py"),
     "bench/limit.py": ("bench/test_limit.py", "bench/test_door.py"),
-    "bench/compare.py": ("bench/test_compare.py", "bench/test_cli.py"),
-    "bench/store.py": ("bench/test_store.py", "bench/test_run.py bench/test_full.py"),
+    "bench/compare.py": ("bench/test_compare.py", "bench/test_cli.py bench/trials/test_judging.py"),
+    "bench/store.py": ("bench/test_store.py", "bench/test_run.py bench/test_full.py bench/test_choice.py"),
     "systems/terms.py": ("systems/test_terms.py", "systems/test_systems.py systems/test_parser.py"),
-    "systems/stencil.py": ("systems/test_stencil.py systems/test_motion.py", "systems/test_systems.py"),
+    "systems/stencil.py": (
+        "systems/test_stencil.py systems/test_motion.py", "systems/test_systems.py methods/test_streaming.py"),
     "systems/simulate.py": ("systems/test_simulate.py systems/test_observe.py", "systems/test_motion.py"),
     "methods/engine/derivatives.py": ("methods/engine/test_derivatives.py methods/test_sindy.py", CONTRACT),
     "methods/engine/regression.py": ("methods/test_sindy.py methods/test_streaming.py", CONTRACT),
@@ -72,6 +75,16 @@ MODULES = {
 }  # fmt: skip
 LIMIT = 600.0
 SEED = 1
+COLUMNS = ["module", "line", "operator", "noticed by", "changed to", "commit"]
+# Why a mutant that survived does what the code does, by its line as it was changed.
+EQUAL: dict[str, str] = {
+    'return value if math.isfinite(value) else ("inf" if value >= 0 else "-inf")': "an infinite number is not 0",
+    "positive = d[d > 1e-12 * d[- 0]]": "-0 is 0",
+    "HOPELESS, TRIED = 10**9, 11**5": "another bound on what is tried",
+    'if not {"results", "origins", "suite", "about"} < names:': "a store has further tables",
+    "rows, seen = (*self.rows, piece), self.seen ^ len(piece.target)": "another seed of a draw",
+    "points = slice(int(some[0]), int(some[-1]) // 1)": "a test function is nearly 0 at the last of its points",
+}
 
 
 def copied(folder: Path) -> Path:
@@ -100,12 +113,12 @@ def drawn(module: str, count: int) -> list[Any]:
     return [every[place] for place in sorted(chosen)]
 
 
-def tried(module: str, count: int) -> Iterator[tuple[Any, ...]]:
-    """Try the mutants of a module; the working folder is the copy."""
+def tried(module: str, mutations: Iterable[Any], commit: str) -> Iterator[tuple[Any, ...]]:
+    """Try mutants of a module; the working folder is the copy."""
     from cosmic_ray.mutating import mutate_and_test
     from cosmic_ray.work_item import TestOutcome
 
-    for mutation in drawn(module, count):
+    for mutation in mutations:
         by, line = "", ""
         for stage, tests in zip(("nearest", "near"), MODULES[module], strict=True):
             files = " ".join(f"tests/{name}" for name in tests.split())
@@ -115,9 +128,20 @@ def tried(module: str, count: int) -> Iterator[tuple[Any, ...]]:
             if result.test_outcome != TestOutcome.SURVIVED:
                 by = stage
                 break
-        row = (module, mutation.start_pos[0], mutation.operator_name.partition("/")[2], by or "survived", line)
+        row = (module, mutation.start_pos[0], _operator(mutation), by or "survived", line, commit)
         print(*row, flush=True)
         yield row
+
+
+def _operator(mutation: Any) -> str:
+    return str(mutation.operator_name.partition("/")[2])
+
+
+def known(before: pd.DataFrame, module: str, mutations: Sequence[Any]) -> list[tuple[Any, ...]]:
+    """Return the rows of these mutants in an earlier table; none if the module has changed since."""
+    rows = list(before[before["module"] == module].itertuples(index=False, name=None))
+    same = [row[1:3] for row in rows] == [(one.start_pos[0], _operator(one)) for one in mutations]
+    return rows if same else []
 
 
 def intervals(noticed: int, count: int) -> str:
@@ -130,40 +154,56 @@ def intervals(noticed: int, count: int) -> str:
 
 def page() -> str:
     """Return the text of mutants.md, made from mutants.csv beside this file."""
-    table = pd.read_csv(HERE / "mutants.csv", comment="#", keep_default_na=False)
+    table = _table()
+    table["why"] = [EQUAL.get(text, "") for text in table["changed to"]]
+    survived = table["noticed by"] == "survived"
     groups = [*table.groupby("module", sort=False), ("all", table)]
     short = pd.DataFrame(
         [
             (name, len(group), int(group["noticed by"].eq("nearest").sum()), int(group["noticed by"].eq("near").sum()),
-             intervals(int(group["noticed by"].ne("survived").sum()), len(group)))
+             int((group["noticed by"].eq("survived") & group["why"].ne("")).sum()),
+             intervals(int(group["noticed by"].ne("survived").sum()), len(group)),
+             intervals(int(group["noticed by"].ne("survived").sum()),
+                       len(group) - int((group["noticed by"].eq("survived") & group["why"].ne("")).sum())))
             for name, group in groups
         ],
-        columns=["module", "mutants", "noticed by the nearest tests", "by near ones", "noticed [95 %]"],
+        columns=["module", "mutants", "noticed by the nearest tests", "by near ones", "do the same",
+                 "noticed [95 %]", "of those that do something else [95 %]"],
     )  # fmt: skip
-    left = table[table["noticed by"] == "survived"].drop(columns="noticed by")
     about = "".join(f"- {name}: {told}\n" for name, told in read_head(HERE / "mutants.csv").items())
     return (
         "# Mutants\n\nMade by `make mutants` (`results/mutants/mutants.py`, which says what is changed and which tests "
-        f"are asked).\n\n{markdown_table(short)}\n\nWhat survives, as the line was changed:\n\n"
-        f"{markdown_table(left)}\n\n{about}"
+        f"are asked).\n\n{markdown_table(short)}\n\nWhat survives, as the line was changed, and why it does the same "
+        f"where it does:\n\n{markdown_table(table[survived].drop(columns=['noticed by', 'commit']))}\n\n{about}"
     )
+
+
+def _table() -> pd.DataFrame:
+    path = HERE / "mutants.csv"
+    return pd.read_csv(path, comment="#", keep_default_na=False) if path.exists() else pd.DataFrame(columns=COLUMNS)
 
 
 def main() -> None:
     """Try the mutants, and write the two files after each module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=10, help="mutants per module; 0 for all")
+    parser.add_argument("--again", action="store_true", help="try only those that survived before")
     given = parser.parse_args()
-    about = {"command": f"python results/mutants/mutants.py --count {given.count}", **origin(), "seed": SEED}
+    command = f"python results/mutants/mutants.py --count {given.count}" + " --again" * given.again
+    about = {"command": command, **origin(), "seed": SEED}
+    before = _table() if given.again else pd.DataFrame(columns=COLUMNS)
     rows: list[tuple[Any, ...]] = []
     with tempfile.TemporaryDirectory() as folder:
         copy = copied(Path(folder).resolve())
         for module in MODULES:
             os.chdir(copy)
-            rows += tried(module, given.count)
+            mutations = drawn(module, given.count)
+            earlier = known(before, module, mutations)
+            noticed = {place: row for place, row in enumerate(earlier) if row[3] != "survived"}
+            new = tried(module, [one for place, one in enumerate(mutations) if place not in noticed], about["commit"])
+            rows += [noticed[place] if place in noticed else next(new) for place in range(len(mutations))]
             os.chdir(ROOT)
-            table = pd.DataFrame(rows, columns=["module", "line", "operator", "noticed by", "changed to"])
-            write_text(HERE / "mutants.csv", render(table, about, "csv"))
+            write_text(HERE / "mutants.csv", render(pd.DataFrame(rows, columns=COLUMNS), about, "csv"))
             write_text(HERE / "mutants.md", page())
 
 
