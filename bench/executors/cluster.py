@@ -45,6 +45,8 @@ MOST_LOCAL = 1024
 WALLTIME = re.compile(r"(?:(\d{1,3})-)?(\d{1,3}):([0-5]\d):([0-5]\d)")
 # Seconds after which a worker that says nothing is taken to be lost; Dask's own is five minutes.
 SILENCE = "60s"
+# Milliseconds between two looks at whether a worker of this machine is to be replaced.
+REPLACE = 2000.0
 
 
 @dataclass(frozen=True)
@@ -194,12 +196,29 @@ def _cluster(place: Place) -> Any:
         from distributed import LocalCluster
 
         # Each case has a process of its own with its limits: that of Dask's worker needs none.
-        return LocalCluster(
+        cluster = LocalCluster(
             n_workers=place.local, threads_per_worker=1, memory_limit=0, host="127.0.0.1", dashboard_address=":0",
             silence_logs=logging.CRITICAL,
             preload=["latticebench.bench.executors.station"],
         )  # fmt: skip
+        _replace_lost(cluster, place.local)
+        return cluster
     return _batch_system(place.jobs)
+
+
+def _replace_lost(cluster: Any, count: int) -> None:
+    """Have workers replaced that were lost while they started: Dask gives these up."""
+    from distributed import Status
+    from tornado.ioloop import PeriodicCallback
+
+    def look() -> None:
+        for name, worker in list(cluster.workers.items()):
+            if worker.status in (Status.failed, Status.closed):
+                del cluster.workers[name]
+        cluster.scale(count)
+
+    # It ends with the loop, which is the cluster's own.
+    cluster.loop.add_callback(PeriodicCallback(look, REPLACE).start)
 
 
 def _quiet() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import pickle
 import platform
 import time
@@ -37,6 +38,8 @@ WAIT = 0.05
 # Seconds that a worker has for an answer, besides what its cases may take; that it has to end its process at the end.
 ANSWER = 300.0
 FAREWELL = 5.0
+# Seconds without any worker after which the user is told.
+ALONE = 30.0
 
 
 class RefusedError(Exception):
@@ -80,14 +83,21 @@ class Crew:
         Raises:
             InputError: there is no worker that can be used, the scheduler is gone, or a result cannot be kept.
         """
+        since: float | None = None
         try:
             while self.batches.open:
                 await self._look()
                 self.ledger.pulse()
                 if self.tasks:
+                    since = None
                     await asyncio.wait(self.tasks.values(), timeout=LOOK, return_when=asyncio.FIRST_COMPLETED)
-                else:
-                    await asyncio.sleep(LOOK)
+                    continue
+                now = time.monotonic()
+                since = now if since is None else since
+                if now - since > ALONE:
+                    self.tell(f"there has been no worker for {ALONE:.0f} s: waiting for one")
+                    since = math.inf
+                await asyncio.sleep(LOOK)
         finally:
             await self._dismiss()
 

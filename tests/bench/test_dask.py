@@ -21,7 +21,7 @@ import pytest
 
 import latticebench
 from latticebench.bench import kinds
-from latticebench.bench.executors import crew
+from latticebench.bench.executors import crew, dask
 from latticebench.bench.executors.cluster import Connection, Place
 from latticebench.bench.executors.dask import Dask
 from latticebench.bench.run import run
@@ -315,6 +315,55 @@ def test_workers_that_are_killed_at_random_moments_lose_nothing_and_make_nothing
     assert sorted(one["case"].get("seed", 1) for one in results) == list(range(1, 21))
     # What was lost is at most the batch that each was on.
     assert list(store.read("SELECT COUNT(*), COUNT(DISTINCT identity) FROM results")) == [(20, 20)]
+
+
+@posix
+@pytest.mark.slow
+def test_workers_that_are_killed_while_they_start_are_replaced(tmp_path: Path) -> None:
+    def started() -> list[psutil.Process]:
+        with suppress(psutil.Error):
+            children = psutil.Process().children()
+            return [one for one in children if one.pid not in before and "spawn_main" in " ".join(one.cmdline())]
+        return []
+
+    before = {one.pid for one in psutil.Process().children()}
+    suite = suite_of(tmp_path / "s", {"good": ""}, seeds="[1, 2, 3]")
+    with Place(local=1).connected() as connection:
+        killed = set[int]()
+        while len(killed) < 3:
+            # The first, and each that Dask starts in its place before it has said that it is there.
+            wait_for(lambda: any(one.pid not in killed for one in started()))
+            for one in started():
+                one.kill()
+                killed.add(one.pid)
+        _, tally = run(suite, create(tmp_path / "store"), executor=Dask(connection))
+    assert (tally.ran, tally.statuses) == (3, {"ok": 3})
+
+
+@posix
+@pytest.mark.slow
+def test_a_run_without_any_worker_says_that_it_waits(
+    start: StartRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(crew, "ALONE", 1.0)
+    monkeypatch.setattr(dask, "_tell", told.append)
+    place = tmp_path / "scheduler.json"
+    start(SCHEDULER, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(place))
+    wait_for(lambda: place.is_file() and place.stat().st_size > 0)
+    address = json.loads(place.read_text())["address"]
+    suite = suite_of(tmp_path / "s", {"good": ""})
+
+    def join() -> None:
+        wait_for(lambda: bool(told))
+        start(WORKER, address, "--nthreads", "1", "--no-dashboard", "--death-timeout", "20")
+
+    joining = threading.Thread(target=join)
+    joining.start()
+    _, tally = run(suite, create(tmp_path / "store"), executor=Dask(Connection(address)))
+    joining.join()
+    assert told == ["there has been no worker for 1 s: waiting for one"]
+    assert tally.statuses == {"ok": 1}
 
 
 @posix
