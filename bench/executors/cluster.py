@@ -207,7 +207,7 @@ def _cluster(place: Place) -> Any:
 
 
 def _replace_lost(cluster: Any, count: int) -> None:
-    """Have workers replaced that were lost while they started: Dask gives these up."""
+    """Have workers replaced that Dask gives up: those that die as they start, or take too long to come back."""
     from distributed import Status
     from tornado.ioloop import PeriodicCallback
 
