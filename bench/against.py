@@ -3,7 +3,7 @@
 A case is one kind of data and one library; what is compared in it is log E2, seed by seed. Where there are seeds
 enough, a case is won if the 95 % interval of the median difference, by a bootstrap over the seeds, lies below 0; with
 fewer seeds, if the error is smaller by more than a hundredth. Over all cases the same bootstrap is over the cases,
-since the seeds of one case are alike. Tests are those of `bench.paired`.
+since the seeds of one case are alike, and so is the test, that of `bench.paired`.
 
 Ranks are of the median errors within each case (1 is the best), over the cases that all ranked methods have. Two
 methods whose mean ranks differ by less than the critical difference of the Nemenyi test,
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from latticebench.bench.paired import FLOOR, LEVEL, holm, signed_rank, verdict
+from latticebench.bench.paired import FLOOR, LEVEL, SignedRank, holm, tested, verdict
 from latticebench.bench.tables import ABOUT, FEW, counted, shown_truth
 from latticebench.systems.errors import InputError, unknown
 
@@ -101,24 +101,27 @@ def against(table: pd.DataFrame, reference: str) -> Contest:
     chosen = _named(reference, list(wide.columns))
     cases: list[tuple[Any, ...]] = []
     methods: list[tuple[Any, ...]] = []
+    leans: list[float] = []
     for name in wide.columns.drop(chosen):
         both = wide[[name, chosen]].dropna()
         if both.empty:
             continue
         own = [(*place, name, chosen, *_case(group)) for place, group in both.groupby(level=ABOUT, sort=False)]
         cases += own
-        first, second = both[name].to_numpy(), both[chosen].to_numpy()
         counts = [sum(row[-1] == outcome for row in own) for outcome in ("win", "loss", "tie")]
         decades = np.log10(np.array([row[6] for row in own], dtype=float).clip(10.0**-ENDLESS, 10.0**ENDLESS))
         spread = [_ratio(value) for value in interval(decades)]
-        methods.append(
-            (name, chosen, len(own), *counts, _ratio(float(np.median(decades))), *spread, signed_rank(first, second))
-        )
+        test = tested(both, "cases")
+        leans.append(test.lean)
+        methods.append((name, chosen, len(own), *counts, _ratio(float(np.median(decades))), *spread, test.p))
     if not methods:
         raise InputError(f"--against {reference}: no other method has a case that it has")
     found = pd.DataFrame(methods, columns=list(METHODS[:-1]))
     found["p"] = holm(found["p"].tolist())
-    found["verdict"] = [verdict(str(row["method"]), chosen, row["ratio"], row["p"]) for _, row in found.iterrows()]
+    found["verdict"] = [
+        verdict(str(row["method"]), chosen, row["ratio"], SignedRank(row["p"], lean))
+        for lean, (_, row) in zip(leans, found.iterrows(), strict=True)
+    ]
     return Contest(found, pd.DataFrame(cases, columns=list(CASES)), _ranks(wide, chosen))
 
 

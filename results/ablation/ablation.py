@@ -93,7 +93,7 @@ def compared(table: pd.DataFrame) -> pd.DataFrame:
     """Return how each method does beside WHOLE, by start and noise: medians of paired ratios, and the paired test."""
     found = []
     for (key, noise), here in table.groupby(["part", "noise"], sort=False):
-        part, tests = str(key), paired(here)
+        part, tests = str(key), paired(here, over="seeds")
         for method in dict.fromkeys(here["method"]):
             own = here[here["method"] == method]
             row = {"start": STARTS[part], "noise": noise, "method": method, "fits": len(own)}
@@ -123,7 +123,8 @@ def page() -> str:
         "the equation that grows until it holds. `drawn`: the layer stays as it was drawn. `soft`: the weight stays "
         "where it starts. `narrow`: 24 units; `narrow-tanh`: of them, tanh in place of sines; `-drawn`: not trained. "
         "ratio: the median over pairs (same samples and seed) of the error over that of "
-        f"`{WHOLE}`; p: signed-rank test, corrected for all pairs of methods (Holm); lost: fits without a result. "
+        f"`{WHOLE}`; p: signed-rank test over the seeds of these four lattices, corrected for all pairs of methods (Holm); "
+        "lost: fits without a result. "
         "E2 and seconds are medians over lattices, seeds and initial states. ![Error and cost](cost.png)\n\n"
         f"{markdown_table(compared(load()))}\n\n{''.join(about)}"
     )
