@@ -136,6 +136,7 @@ def _show(found: Contest) -> None:
     rows = readable(found.methods)
     show_rows(list(rows.columns), rows.to_numpy().tolist())
     show_note("per case: E2 smaller, larger, not told apart; ratio of E2, median over the cases with its 95 % interval")
+    show_note(f"p: signed-rank test over the cases, corrected for {len(found.methods)} methods (Holm)")
     if found.ranks is None:
         show_note("no mean ranks: they need three methods and two cases that all of them have")
         return

@@ -123,8 +123,8 @@ def page() -> str:
         "the equation that grows until it holds. `drawn`: the layer stays as it was drawn. `soft`: the weight stays "
         "where it starts. `narrow`: 24 units; `narrow-tanh`: of them, tanh in place of sines; `-drawn`: not trained. "
         "ratio: the median over pairs (same samples and seed) of the error over that of "
-        f"`{WHOLE}`; p: signed-rank test over the seeds of these four lattices, corrected for all pairs of methods (Holm); "
-        "lost: fits without a result. "
+        f"`{WHOLE}`; p: signed-rank test over the seeds of these four lattices, corrected for all pairs of methods "
+        "(Holm); lost: fits without a result. "
         "E2 and seconds are medians over lattices, seeds and initial states. ![Error and cost](cost.png)\n\n"
         f"{markdown_table(compared(load()))}\n\n{''.join(about)}"
     )

@@ -59,9 +59,9 @@ def test_runs_without_a_common_case_cannot_be_compared() -> None:
 def test_a_method_is_better_only_where_enough_pairs_say_so() -> None:
     rng = np.random.default_rng(1)
     sizes = np.exp(rng.normal(size=(2, 12)))
-    old = fits(*(("a", seed, float(sizes[0, seed])) for seed in range(12)), *(("b", s, 0.1) for s in range(4)))
+    old = fits(*(("a", seed, float(sizes[0, seed])) for seed in range(12)), *(("b", s, 0.1 + s) for s in range(4)))
     better = fits(
-        *(("a", seed, float(sizes[0, seed]) * 0.9) for seed in range(12)), *(("b", s, 0.01) for s in range(4))
+        *(("a", seed, float(sizes[0, seed]) * 0.9) for seed in range(12)), *(("b", s, 0.01 + s / 10) for s in range(4))
     )
     other = fits(
         *(("a", seed, float(sizes[1, seed])) for seed in range(12)), *(("b", s, None, "failed") for s in range(4))
