@@ -17,6 +17,7 @@ from latticebench.methods.method import Fit, Method, Skipped, solve
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
+from latticebench.systems.user_files import raised
 
 if TYPE_CHECKING:
     from latticebench.bench.adequacy import Adequacy
@@ -115,4 +116,4 @@ def told(data: Sequence[Samples], method: str = "") -> Iterator[None]:
         raise
     except Exception as error:
         what = f"method {method!r}" if method else "the computation"
-        raise InputError(f"{source}: {what} failed: {type(error).__name__}: {error}") from error
+        raise InputError(f"{source}: {what} failed: {raised(error)}") from error

@@ -127,6 +127,8 @@ def show(
             kind.show(results, value)
         for line in lines(found[0][3]):
             show_note(line)
+        if others := store.others():
+            show_note(f"of other cases, which were run here before: {others}; the same run again shows them")
 
 
 def rows(store: Store, shard: Shard = WHOLE, beside: Published | None = None) -> list[dict[str, Any]]:

@@ -188,6 +188,11 @@ class Store:
         )
         return dict(self.read(query, (shard.step, shard.first - 1)))
 
+    def others(self) -> int:
+        """Return how many results there are of cases that the suite that was run last does not have."""
+        ((count,),) = self.read("SELECT COUNT(*) FROM results WHERE key NOT IN (SELECT key FROM suite)")
+        return int(count)
+
     def kinds(self) -> list[str]:
         """Return the kinds of the finished cases of the suite that was run last."""
         return [kind for (kind,) in self.read("SELECT DISTINCT kind FROM suite JOIN results USING (key) ORDER BY kind")]

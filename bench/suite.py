@@ -65,6 +65,8 @@ from latticebench.systems.toml import read_toml
 
 HERE = Path(__file__).parent / "suites"
 ALL = Choice()
+# Parts of a suite that are named where nothing was chosen.
+LISTED = 12
 
 
 Label = Annotated[str, pydantic.StringConstraints(pattern=r"\S", max_length=200)]
@@ -171,14 +173,20 @@ def load(name: str, data: Path = DATA, *, large: bool = False, choice: Choice = 
         _fits(file, shown, large, choice, contestants), _trials(file, shown, folders.suite, choice),
         _laboratory(file, shown, choice), _recordings(file, shown),
     )  # fmt: skip
+    parts: dict[str, None] = {}
     for case in itertools.chain(*blocks):
+        parts.setdefault(case.part or str(getattr(case, "data", case.title)))
         # What two parts share belongs to the first.
         if choice.takes(case):
             cases.setdefault(case.identity, case)
         if not large:
             check_cases(len(cases), shown)
     if not cases:
-        raise InputError(f"{shown}: there is no case of this choice: {choice}")
+        there = [repr(one) for one in parts]
+        more = f" and {len(there) - LISTED} more" if len(there) > LISTED else ""
+        raise InputError(
+            f"{shown}: there is no case of this choice: {choice}; there are {', '.join(there[:LISTED])}{more}"
+        )
     _check_methods(contestants, folders.methods, shown)
     try:
         _look_up((case for case in cases.values() if isinstance(case, FitCase)), folders.suite, large)
@@ -328,9 +336,11 @@ def _unsound(where: str, error: pydantic.ValidationError, model: type[Settings])
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     path = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        nested = len(first["loc"]) > 1
-        known = Contestant.model_fields if nested else model.model_fields
-        return unknown("key", str(first["loc"][-1]), known, f"{where}: {path}" if nested else where)
+        key, nested = str(first["loc"][-1]), len(first["loc"]) > 1
+        if not nested:
+            return unknown("key", key, model.model_fields, where)
+        wrong = unknown("key", key, Contestant.model_fields, f"{where}: {path}")
+        return InputError(f"{wrong}; a setting of the method is written as settings = {{ {key} = ... }}")
     given = "" if first["type"] == "missing" else f", it is {first['input']!r}"
     told = first["msg"].removeprefix("Value error, ")
     return InputError(f"{where}: {path}: {told[0].lower()}{told[1:]}{given}")

@@ -16,6 +16,7 @@ from latticebench.bench.memory import memory_limit
 from latticebench.bench.tree import adopt_orphans
 from latticebench.methods.method import Skipped
 from latticebench.systems.errors import InputError
+from latticebench.systems.user_files import raised
 
 MAX_REASON = 300
 # Bytes of a result as JSON.
@@ -88,7 +89,7 @@ def attempt(case: Case, folders: Folders) -> dict[str, Any]:
         text = _text(error)
         if "allocate memory" in text or "Unable to allocate" in text:
             return outcome(case, "memory", too_much(case), found)
-        told = text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"
+        told = text if isinstance(error, InputError) else raised(error)
         return outcome(case, "failed", told, found if _is_result(found) else None)
     return outcome(case, "ok", "", found)
 

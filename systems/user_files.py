@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import traceback
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,25 @@ def load_system(path: Path) -> System:
         raise InputError(f"{path}: {error}") from None
 
 
+# What the names of users' modules begin with.
+USER = "latticebench_user_"
+
+
+def raised(error: BaseException) -> str:
+    """Return the type and text of an exception, and the last line of a user's file that it went through."""
+    try:
+        text = str(error)
+    except Exception:
+        # Code of the user's may raise anything.
+        text = "it says nothing"
+    lines = [
+        f" ({Path(frame.f_code.co_filename).name}, line {line})"
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if str(frame.f_globals.get("__name__", "")).startswith(USER)
+    ]
+    return f"{type(error).__name__}: {text}{lines[-1] if lines else ''}"
+
+
 def load_module(path: Path) -> Any:
     """Import a Python file under a name of its own, and return the module.
 
@@ -49,7 +69,7 @@ def load_module(path: Path) -> Any:
         InputError: the file is missing or fails when it is imported.
     """
     check_regular(path)
-    spec = importlib.util.spec_from_file_location(f"latticebench_user_{path.stem}", path)
+    spec = importlib.util.spec_from_file_location(f"{USER}{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -69,7 +89,7 @@ def load_module(path: Path) -> Any:
             raise
         if isinstance(error, InputError):
             raise InputError(f"{path}: {error}") from error
-        raise InputError(f"{path}: it cannot be imported: {type(error).__name__}: {error}") from error
+        raise InputError(f"{path}: it cannot be imported: {raised(error)}") from error
     return module
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -52,6 +53,8 @@ def figures(
         drawn = folder / "figures" if out is None else out
         check_places([], out=drawn / "figure.png")
         files = kinds.draw(store, drawn, only, published)
+    if not files:
+        print("no figure: these results have nothing that it could show", file=sys.stderr)
     if as_json:
         from latticebench.bench.report.document import provenance, to_json
         from latticebench.bench.report.outputs import FiguresDocument

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from latticebench.bench import kinds
 from latticebench.bench.case import Case, Folders
 from latticebench.bench.choice import chosen
 from latticebench.bench.estimate import estimate
@@ -156,7 +157,7 @@ def test_trials_take_seeds_and_patterns_and_recordings_stay_as_they_are(tmp_path
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ((["phi5*"],), "there is no case of this choice: only phi5"),
+        ((["phi5*"],), r"there is no case of this choice: only phi5\*; there are 'one', 'two'"),
         ((None, ["denes"]), "--methods: unknown method 'denes'; did you mean 'dense'"),
         ((["two"], ["dense"]), "no case of this choice: only two; methods dense"),
         ((None, ["a,,b"]), "--methods: one of them is empty"),
@@ -171,6 +172,23 @@ def test_what_cannot_be_chosen_is_one_line(path: str, given: tuple[Any, ...], to
     with pytest.raises(InputError, match=told) as error:
         load(path, choice=chosen(*given))
     assert "\n" not in str(error.value)
+
+
+def test_results_of_an_earlier_choice_are_told_of(
+    path: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = create(tmp_path / "store")
+    for only, others in (("one", 0), ("two", 16), ("*", 0)):
+        run(load(path, choice=chosen([only])), store, jobs=1)
+        assert store.others() == others
+        kinds.show(store)
+        assert ("which were run here before: 16" in capsys.readouterr().out) == (others == 16)
+
+
+def test_a_setting_beside_the_method_is_told_where_it_belongs(tmp_path: Path) -> None:
+    (tmp_path / "t.toml").write_text(SUITE.replace('method = "zero"', 'method = "stlsq"\nthreshold = 0.1'))
+    with pytest.raises(InputError, match=r"methods\.floor\.threshold: .* settings = \{ threshold = \.\.\. \}"):
+        load(str(tmp_path / "t.toml"))
 
 
 def test_a_suite_of_the_diagnosis_has_no_methods_and_recordings_have_no_seeds(tmp_path: Path) -> None:

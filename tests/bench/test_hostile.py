@@ -18,6 +18,7 @@ from latticebench.bench.run import run
 from latticebench.bench.store import create
 from latticebench.bench.suite import load
 from latticebench.systems.errors import InputError
+from latticebench.systems.user_files import load_module, raised
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks, and looks at processes")
 
@@ -209,6 +210,13 @@ def test_a_hostile_method_that_is_fitted_is_one_line_with_the_reason(deed: str, 
     assert DEEDS[deed][3] in line
     assert not (tmp_path / "r.json").exists()
     assert alive(MARKER) == []
+
+
+def test_what_a_method_raises_is_told_with_its_file_and_line(tmp_path: Path) -> None:
+    (tmp_path / "m.py").write_text("def deep():\n    return [].foo\n\n\nMETHODS = (deep(),)\n")
+    with pytest.raises(InputError, match=r"AttributeError: 'list' object has no attribute 'foo' \(m\.py, line 2\)"):
+        load_module(tmp_path / "m.py")
+    assert raised(ValueError("elsewhere")) == "ValueError: elsewhere"
 
 
 def test_a_suite_names_a_method_file_that_is_not_there(tmp_path: Path) -> None:
