@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.bench.noise import centred, left_by
+from latticebench.bench.noise import left_by, of_sensors
 from latticebench.bench.overlay import motion_of
-from latticebench.diagnosis.instrument import of_readings, two_digits
+from latticebench.diagnosis.instrument import two_digits
 from latticebench.diagnosis.problem import Spectrum
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.engine.derivatives import DEGREE
@@ -38,7 +38,7 @@ from latticebench.methods.engine.windows import WINDOW, is_wide, window
 from latticebench.systems.samples import Samples, SimulatedSamples
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
     from numpy import ndarray
 
     from latticebench.methods.method import Fit
@@ -76,11 +76,12 @@ class Adequacy:
         work: share of the forces' work over half a period that is left (root mean square, 0 to 1 and beyond).
         r2: R^2 of the readings half a period ahead, 1 where they are met.
         times: what is left in units of the noise of the readings; of the motion that the method followed, if it
-            followed one. NaN where the readings do not show their noise.
+            followed one. NaN where the readings do not show their noise, or have none.
         fits: whether the equation describes the readings, and they determine its coefficients.
         warnings: what a user has to know, the most important first; empty where the equation fits.
         unknown: the terms whose coefficients the readings do not determine.
         unread: the columns of sites that were never read, which move as the equation says.
+        silent: whether the readings have no noise.
     """
 
     work: float
@@ -90,6 +91,7 @@ class Adequacy:
     warnings: tuple[str, ...] = ()
     unknown: tuple[str, ...] = ()
     unread: str = ""
+    silent: bool = False
 
     def state(self, status: str) -> str:
         """Return in a few words how a fit came out that says `status` of itself."""
@@ -109,8 +111,8 @@ class Adequacy:
             parts.append(f"half a period ahead it leaves {two_digits(100 * self.work)} % of what the forces do")
         if np.isfinite(self.r2):
             parts.append(f"R^2 = {self.r2:.4g}" if self.r2 > -1 else "R^2 < -1")
-        hidden = np.isnan(self.times)
-        parts.append("the noise is not seen" if hidden else f"{two_digits(self.times)} times the noise is left")
+        hidden = "the readings have no noise" if self.silent else "the noise is not seen"
+        parts.append(hidden if np.isnan(self.times) else f"{two_digits(self.times)} times the noise is left")
         if self.unread:
             parts.append(f"nothing was read of {self.unread}")
         return "; ".join(parts)
@@ -121,8 +123,10 @@ class _Sums:
     """Sums of squares for each place of one recording: what the equation leaves, what forces do, and the readings'.
 
     In `noise` what is left is in units of the noise, over the readings that show theirs, of which there are `told`.
+    `silent` says of which recording no reading has any.
     """
 
+    silent: Bool[ndarray, " place"]
     left: Float[ndarray, " place"]
     forces: Float[ndarray, " place"]
     spread: Float[ndarray, " place"]
@@ -145,6 +149,7 @@ def adequacy(data: Sequence[Samples], fit: Fit) -> Adequacy:
         return Adequacy(np.nan, np.nan, np.nan, fits=True)
     place = {name: np.concatenate([getattr(one, name) for one in sums]) for name in vars(sums[0])}
     best = np.argsort(place["left"])[: max(1, round((1 - WORST) * len(place["left"])))]
+    silent = bool(np.all(place.pop("silent")))
     left, forces, spread, noise, told = (float(np.sum(one[best])) for one in place.values())
     work = float(np.sqrt(left / forces)) if forces > 0 else np.nan
     r2 = 1 - left / spread if spread > 0 else np.nan
@@ -153,10 +158,11 @@ def adequacy(data: Sequence[Samples], fit: Fit) -> Adequacy:
     if fit.motion is not None and fit.found.get("noise_u"):
         by_motion = left_by(shown, fit)
         times, misfit = by_motion.times, misfit or by_motion.misfit
+    times = np.nan if silent else times
     unknown = _unknown(courses, fit)
     warnings = (*(_of_misfit(fit, work, times) if misfit else ()), *_of_unknown(unknown))
     unread = next((one.columns(one.unread) for one in shown if one.unread), "")
-    return Adequacy(work, r2, times, not warnings, warnings, unknown, unread)
+    return Adequacy(work, r2, times, not warnings, warnings, unknown, unread, silent)
 
 
 def _at_places(data: Sequence[Samples], fit: Fit) -> tuple[list[Samples], Fit]:
@@ -225,13 +231,15 @@ def _followed(course: _Course, fit: Fit) -> _Sums:
     away = AWAY * float(np.nanmax(np.abs(seen - middle), initial=0.0))
     wrong = np.nan_to_num(found.reshape(shape)[:, 0] - seen, nan=away, posinf=away, neginf=away)
     wrong = np.where(known, np.clip(wrong, -away, away), 0.0)
-    noise = of_readings(t, centred(samples.u))[dynamics.moving]
+    shown, silent = of_sensors(t, samples.u)
+    noise = shown[dynamics.moving]
     told = known & np.isfinite(noise) & (noise > 0)
     parts = [
         wrong**2, np.nan_to_num(free - seen) ** 2, np.nan_to_num(seen - middle) ** 2,
         np.where(told, wrong / np.where(noise > 0, noise, 1.0), 0.0) ** 2, told,
     ]  # fmt: skip
-    return _Sums(*(np.sum(one, axis=(1, 2), dtype=float) for one in parts))
+    sums = (np.sum(one, axis=(1, 2), dtype=float) for one in parts)
+    return _Sums(np.full(len(begin), silent), *sums)
 
 
 def _integrated(

@@ -40,9 +40,10 @@ def fit(data: Sequence[Samples], library: Library, order: int, method: Method, s
 def judged(data: Sequence[Samples], found: Fit) -> Adequacy:
     """Return how well a fitted equation describes the recordings it was fitted to, with hints where it does not."""
     from latticebench.bench.adequacy import adequacy
-    from latticebench.bench.inspection import sine_warning
+    from latticebench.bench.report.notes import degrees, resting
 
-    return adequacy(data, found).also(sine_warning(data, found.library))
+    hints = (line for one in data for line in (*degrees(one, found.library), *resting(one)))
+    return adequacy(data, found).also(tuple(dict.fromkeys(hints)))
 
 
 def diagnose(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.noise import centred
-from latticebench.bench.report.notes import at_ends, strays, turns
+from latticebench.bench.report.notes import at_ends, degrees, resting, strays, turns
 from latticebench.diagnosis.instrument import of_readings, step_of
 from latticebench.diagnosis.problem import Spectrum
 from latticebench.methods.engine.dynamics import split_parts
@@ -22,9 +22,6 @@ from latticebench.systems.samples import Samples
 if TYPE_CHECKING:
     from numpy import ndarray
 
-# An argument of a sine beyond this is hardly an angle in radians, unless something turns over and over.
-ANGLE = 10.0
-PERIODIC = ("sin", "cos", "tan")
 # A step between readings this many times the usual one is a gap.
 GAP = 2.5
 # A share of the noise's variance that makes rounding worth a word.
@@ -131,15 +128,13 @@ def _suspicious(
     samples: Samples, sensors: Sequence[Sensor], peaks: Sequence[float], terms: Library | None
 ) -> Iterator[str]:
     """Yield what deserves a look, one sentence each."""
-    yield from _of_terms(samples, terms)
+    yield from () if terms is None else degrees(samples, terms)
     known: dict[bytes, str] = {}
     for site, one in enumerate(sensors):
         values = _values(samples.u[:, site])
         if one.readings == 0:
             yield f"{one.name}: nothing was read"
-        elif np.ptp(values) == 0:
-            yield f"{one.name}: always {one.most:g}; does this sensor work?"
-        else:
+        elif np.ptp(values) > 0:
             for level, count, end in at_ends(values / samples.origin.scale):
                 yield f"{one.name}: {count} readings of just {level:g} and none {end}; are they clipped?"
             if one.noise > 0 and one.step**2 / 12 > ROUNDED * one.noise**2:
@@ -147,6 +142,7 @@ def _suspicious(
         first = known.setdefault(_key(samples.u[:, site]), one.name)
         if one.readings and first != one.name:
             yield f"{one.name}: the same readings as {first}; is one a copy of the other?"
+    yield from resting(samples)
     yield from strays(samples)
     yield from turns(samples)
     span, usual = float(np.ptp(samples.t)), float(np.median(np.diff(samples.t)))
@@ -160,20 +156,3 @@ def _suspicious(
 def _key(field: ndarray) -> bytes:
     """Return the same for the same readings, where zero has no sign and missing ones are alike."""
     return np.where(np.isnan(field), np.nan, field + 0.0).tobytes()
-
-
-def _of_terms(samples: Samples, terms: Library | None) -> Iterator[str]:
-    """Yield where readings make no sense in the terms."""
-    if terms is None or not any(terms.uses(name) for name in PERIODIC):
-        return
-    largest = float(np.nanmax(np.abs(samples.u)))
-    if largest > ANGLE:
-        name, unit = next(one for one in PERIODIC if terms.uses(one)), samples.origin.unit
-        known = unit in ("deg", "arcmin")
-        remedy = f"read the angles with --scale {unit}" if known else "if these are degrees: --scale deg"
-        yield f"u reaches {largest:.3g} in {name}(...), which takes radians; {remedy}"
-
-
-def sine_warning(data: Sequence[Samples], terms: Library) -> tuple[str, ...]:
-    """Return what is to be said of readings too large for the sines of an equation."""
-    return tuple(dict.fromkeys(line for one in data for line in _of_terms(one, terms)))

@@ -41,6 +41,10 @@ CORRELATED, LAGS = 0.15, 8
 SURE = 4.0
 
 
+# Readings without noise show what integrators and rounding leave; this share of their size is more than that.
+SILENT = 1e-6
+
+
 # A share of its readings that is left to a site without an equation, at least, however many splines it follows.
 LEAST_SPARE = 0.05
 TINY = np.finfo(float).tiny
@@ -53,23 +57,26 @@ class Left:
     Attributes:
         noise: of each sensor: u of each site, then, for order 2 if it was observed, v.
         lines: the noise in words and in the units of the readings.
-        times: how many times the noise that the readings show the fit leaves; NaN where they do not show it.
+        times: how many times the noise that the readings show the fit leaves; NaN where they do not show it or have
+            none.
         misfit: whether that is more than noise.
+        silent: whether the readings have no noise.
     """
 
     noise: Noise
     lines: tuple[str, ...]
     times: float
     misfit: bool
+    silent: bool = False
 
     @property
     def warning(self) -> tuple[str, ...]:
         """What is to be said where the equation misfits, or where that cannot be told."""
         if self.misfit:
-            return (
-                f"the equation leaves {two_digits(self.times)} times the noise: these bounds do not hold; "
-                "see `latticebench diagnose`",
-            )
+            much = "a part of readings without noise" if self.silent else f"{two_digits(self.times)} times the noise"
+            return (f"the equation leaves {much}: these bounds do not hold; see `latticebench diagnose`",)
+        if self.silent:
+            return ()
         if self.times > FAR:
             return (
                 f"neighbouring readings differ by {two_digits(self.times)} times less than such noise without "
@@ -90,6 +97,19 @@ def centred(field: ndarray) -> ndarray:
     with np.errstate(invalid="ignore"):
         middle = np.array([np.mean(one[np.isfinite(one)]) if np.any(np.isfinite(one)) else 0.0 for one in field.T])
     return np.asarray(field - middle)
+
+
+def of_sensors(t: Float[ndarray, " time"], field: ndarray) -> tuple[Float[ndarray, " sites"], bool]:
+    """Return the noise that each sensor shows by itself, at least SILENT of their size, and whether all is that.
+
+    See `latticebench.diagnosis.instrument.of_readings`; of complex readings it is the size per part.
+    """
+    about = centred(field)
+    shown = of_readings(t, about)
+    square = np.nanmean(np.abs(about[:, np.any(np.isfinite(about), axis=0)]) ** 2, axis=0)
+    least = SILENT * float(np.sqrt(np.max(square, initial=0.0)))
+    told = np.isfinite(shown)
+    return np.maximum(shown, least), bool(np.any(told) and np.all(shown[told] <= least))
 
 
 def readings(samples: Samples, order: int) -> Channels:
@@ -134,10 +154,10 @@ def left_by(data: Sequence[Samples], fit: Fit) -> Left:
     scale = units[rows.sensor]
     noise = estimate(own / scale, level / scale, rows, free=free)
     noise = replace(noise, size=noise.size * units)
-    ratios = _ratios(data, left, noise, rows, order)
+    ratios, silent = _ratios(data, left, noise, rows, order)
     times = float(np.sqrt(np.mean(ratios**2))) if len(ratios) else np.nan
     misfit = bool(times > FAR) and not _is_memory(noise, left, level, rows)
-    return Left(noise, tuple(_lines(data, noise, order)), times, misfit)
+    return Left(noise, tuple(_lines(data, noise, order)), np.nan if silent else times, misfit, silent)
 
 
 def _unspent(left: Channels, records: Sequence[Record], rows: Rows) -> Channels:
@@ -155,11 +175,11 @@ def _unspent(left: Channels, records: Sequence[Record], rows: Rows) -> Channels:
 
 def _ratios(
     data: Sequence[Samples], left: Channels, noise: Noise, rows: Rows, order: int
-) -> Float[ndarray, " sensors"]:
-    """Return what is left at each sensor that shows its noise by itself, in units of that."""
+) -> tuple[Float[ndarray, " sensors"], bool]:
+    """Return what is left at each sensor that shows its noise by itself, in units of that, and whether none has any."""
     longest = max(data, key=lambda one: len(one.t))
-    fields = fields_of(longest, order)
-    shown = np.concatenate([of_readings(longest.t, centred(one)) for one in fields])
+    each = [of_sensors(longest.t, one) for one in fields_of(longest, order)]
+    shown = np.concatenate([one for one, _ in each])
     # Single outliers are no misfit.
     heavy = np.isfinite(noise.tail)
     own = np.full(len(shown), np.nan)
@@ -169,7 +189,7 @@ def _ratios(
         if len(values):
             own[sensor] = ROBUST * np.median(np.abs(values)) if heavy else np.sqrt(np.mean(values**2))
     told = np.isfinite(shown) & (shown > 0) & np.isfinite(own)
-    return np.asarray(own[told] / shown[told])
+    return np.asarray(own[told] / shown[told]), all(silent for _, silent in each)
 
 
 def _is_memory(noise: Noise, left: Channels, level: Channels, rows: Rows) -> bool:

@@ -124,7 +124,8 @@ def lines_of_sites(part: SubFigure, overlay: Overlay) -> None:
         axes.set_ylabel(f"site {site + 1}" if crowded else axis(f"{name} at site {site + 1}", overlay.unit), fontsize=8)
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.25)
-    every[-1].set_xlabel(axis("t", overlay.time_unit))
+    part_of_it = ", where the first curve is worst" if len(t) < len(overlay.t) else ""
+    every[-1].set_xlabel(axis("t", overlay.time_unit) + part_of_it)
     if overlay.curves:
         handles = every[0].get_legend_handles_labels()
         part.legend(*handles, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
@@ -145,15 +146,15 @@ def _kinds(curves: Mapping[str, ndarray]) -> dict[str, dict[str, str]]:
 
 
 def _telling(overlay: Overlay) -> tuple[list[int], slice]:
-    """Return the sites and rows whose lines are drawn: those that move most, and where the first curve is worst."""
+    """Return the sites and rows whose lines are drawn: those that move most or where the first curve is worst."""
     if not overlay.curves:
         return overlay.moving(MOST_SITES), slice(None)
     left = np.nan_to_num(overlay.residual(next(iter(overlay.curves))) ** 2, posinf=0.0).sum(axis=1)
     count = min(len(left), MOST_SAMPLES)
     total = np.concatenate([[0.0], np.cumsum(left.sum(axis=1))])
     begin = int(np.argmax(total[count:] - total[:-count]))
-    worst = int(np.argmax(left.sum(axis=0)))
-    return sorted({worst, *overlay.moving(MOST_SITES - 2)}), slice(begin, begin + count)
+    worst = np.argsort(-left.sum(axis=0), kind="stable")[: MOST_SITES // 2].tolist()
+    return sorted({*worst, *overlay.moving(MOST_SITES - 1 - len(worst))}), slice(begin, begin + count)
 
 
 def residuals(part: SubFigure, overlay: Overlay) -> None:

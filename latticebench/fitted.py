@@ -275,6 +275,6 @@ def fit(data: Recording, model: Model, method: str = methods.DEFAULT, seed: int 
         >>> found.warnings
         ()
     """
-    samples = model.of(data)
+    samples = Model.checked(model).of(data)
     result = calls.fit(samples, model.library, model.order, make(methods.find(method), settings), seed)
     return Fitted(result, calls.judged(samples, result), model, data)

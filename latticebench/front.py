@@ -152,8 +152,8 @@ def diagnose(
         InputError: the equation cannot be set up on it, or the two recordings are not of the same chain or not in the
             same units.
     """
+    count = len(Model.checked(model).of(data))
     every = model.of(data if holdout is None else Recording((*data.samples, *holdout.samples)))
-    count = len(data.samples)
     found, report = calls.diagnose(
         every[:count], model.library, model.order, effects=None if effects is None else Path(effects),
         later=every[count:],
@@ -221,7 +221,7 @@ def limit(data: Recording, model: Model, target: float = 0.01) -> Bound:
     """
     from latticebench.bench.limit import design
 
-    found = calls.bound(model.of(data), model.library, model.order)
+    found = calls.bound(Model.checked(model).of(data), model.library, model.order)
     return Bound(found.at(1, 1), design(found.at, target=target), tuple(found.note.splitlines()), tuple(found.warnings))
 
 

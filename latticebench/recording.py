@@ -6,7 +6,7 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import pandas as pd
 
@@ -19,7 +19,7 @@ from latticebench.bench.report.rows import html_table
 from latticebench.bench.report.units import in_words, units_of
 from latticebench.labelled import as_table, is_labelled
 from latticebench.pictures import Film, Picture, Survey
-from latticebench.systems.errors import InputError
+from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
 from latticebench.systems.readers import from_arrays, from_frame, read_all
@@ -276,6 +276,27 @@ class Model:
     order: Literal[1, 2] = 2
     ends: Ends = "unknown"
 
+    def __post_init__(self) -> None:
+        """Refuse what is no model, before there are data."""
+        if not isinstance(self.terms, str):
+            raise InputError(f"a model has its terms in one text with ; between them, not {type(self.terms).__name__}")
+        if self.order not in (1, 2):
+            raise InputError(f"order={self.order!r}: the order of the time derivative is 1 or 2")
+        if self.ends not in get_args(Ends):
+            raise unknown("ends", str(self.ends), get_args(Ends))
+        _ = self.library
+
+    @classmethod
+    def checked(cls, model: Model) -> Model:
+        """Return a model.
+
+        Raises:
+            InputError: it is something else.
+        """
+        if not isinstance(model, cls):
+            raise InputError(f"a model is made by lb.Model('u[n]', order=2), say; this is {type(model).__name__}")
+        return model
+
     @property
     def library(self) -> Library:
         """The terms, read."""
@@ -285,8 +306,10 @@ class Model:
         """Return recordings with the ends of this model.
 
         Raises:
-            InputError: trajectories differ in their sites, columns or units.
+            InputError: it is no recording, or trajectories differ in their sites, columns or units.
         """
+        if not isinstance(data, Recording):
+            raise InputError(f"a recording is what lb.read(...) returns, not {type(data).__name__}")
         found = [replace(one, ends=self.ends) for one in data.samples]
         check_alike(found)
         check_units(found)

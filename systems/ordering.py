@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,7 +50,9 @@ def in_order(arrays: Arrays, source: str, column: str, *, sort: bool) -> tuple[A
 
 
 def unwrapped(u: ndarray, turn: float, source: str) -> ndarray:
-    """Return readings (T, N) that go on where they started anew after a full turn.
+    """Return readings (T, N) that go on where they started anew after a full turn, along time and then along the chain.
+
+    Neighbours are less than half a turn apart when both were first read: whole turns between sensors cannot be read.
 
     Raises:
         InputError: they are complex.
@@ -60,6 +63,11 @@ def unwrapped(u: ndarray, turn: float, source: str) -> ndarray:
     for column in found.T:
         seen = np.isfinite(column)
         column[seen] = np.unwrap(column[seen], period=turn)
+    there = np.flatnonzero(np.any(np.isfinite(found), axis=0))
+    for left, right in itertools.pairwise(there.tolist()):
+        both = np.flatnonzero(np.all(np.isfinite(found[:, [left, right]]), axis=1))
+        if len(both):
+            found[:, right] -= turn * np.round((found[both[0], right] - found[both[0], left]) / turn)
     return found
 
 

@@ -379,3 +379,26 @@ def test_importing_the_package_loads_no_front():
     script = f"import sys, latticebench; print({{*{names}}} & set(sys.modules) or 'none')"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["none"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"order": 3}, "order=3: the order of the time derivative is 1 or 2"),
+        ({"ends": "loose"}, "unknown ends 'loose'"),
+        ({"terms": "u[n"}, r"u\[n"),
+        ({"terms": ["u[n]"]}, "not list"),
+    ],
+)
+def test_what_is_no_model_is_refused_at_once(wrong, told):
+    with pytest.raises(InputError, match=told):
+        lb.Model(**{"terms": "u[n]", **wrong})
+
+
+@pytest.mark.parametrize("act", [lb.fit, lb.diagnose, lb.limit])
+def test_what_is_no_recording_or_no_model_is_one_line(act):
+    model, data = lb.Model("u[n]"), lb.read((np.arange(9.0), np.ones(9)))
+    with pytest.raises(InputError, match=r"a recording is what lb\.read\(\.\.\.\) returns, not str"):
+        act("lab.csv", model)
+    with pytest.raises(InputError, match=r"a model is made by .*; this is str"):
+        act(data, "u[n]")

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
     from latticebench.diagnosis.repair import Diagnosis
+    from latticebench.systems.lattice import Library
 
 # Rounding that makes less of the noise's variance than this is not worth a word.
 ROUNDING = 0.01
@@ -31,6 +32,12 @@ HUM = 2.0
 # A full turn where no unit is known, the share of one that an angle moves by from one reading to the next at most, and
 # how many times as far where it starts anew as elsewhere.
 TURNS, STEADY, LANDING = (2 * np.pi, 360.0), 0.3, 3.0
+# An argument of a sine beyond this is hardly an angle in radians, unless something turns over and over.
+ANGLE = 10.0
+PERIODIC = ("sin", "cos", "tan")
+# A sensor has stopped where so many of its readings on end, and this share of all, are one number, while another moves
+# by this share of its range.
+STOPPED, LONG, MOVES = 20, 0.1, 0.2
 
 
 def at_ends(values: Float[ndarray, " values"]) -> Iterator[tuple[float, int, str]]:
@@ -45,6 +52,50 @@ def at_ends(values: Float[ndarray, " values"]) -> Iterator[tuple[float, int, str
     for level, count, beside, end in ((levels[-1], *counts[:-3:-1], "above"), (levels[0], *counts[:2], "below")):
         if count >= CLIPPED and count > CROWDED * beside:
             yield float(level), int(count), end
+
+
+def degrees(samples: Samples, terms: Library) -> list[str]:
+    """Return where readings make no sense in the sines of an equation."""
+    largest = float(np.nanmax(np.abs(samples.u)))
+    if largest <= ANGLE or not any(terms.uses(name) for name in PERIODIC):
+        return []
+    name, unit = next(one for one in PERIODIC if terms.uses(one)), samples.origin.unit
+    known = unit in ("deg", "arcmin")
+    remedy = f"read the angles with --scale {unit}" if known else "if these are degrees: --scale deg"
+    return [f"u reaches {largest:.3g} in {name}(...), which takes radians; {remedy}"]
+
+
+def resting(samples: Samples) -> list[str]:
+    """Return which sensors always read the same, or do so from some time on while others move."""
+    found = []
+    names = samples.origin.columns or [f"u{site + 1}" for site in range(samples.sites)]
+    for site, column in enumerate(samples.u.T):
+        rows = np.flatnonzero(np.isfinite(column))
+        values = column[rows]
+        if not len(rows):
+            continue
+        if np.all(values == values[0]):
+            level = values[0].real / samples.origin.scale
+            found.append(f"{names[site]}: always {level:g}; does this sensor work?")
+            continue
+        edges = np.flatnonzero(np.diff(values) != 0) + 1
+        # What begins with the record may not have been set in motion yet.
+        for first, last in zip(edges, [*edges[1:], len(rows)], strict=True):
+            if last - first < max(STOPPED, LONG * len(rows)):
+                continue
+            some = slice(rows[first], rows[last - 1] + 1)
+            if any(_range(other[some]) > MOVES * _range(other) > 0 for other in np.delete(samples.u.T, site, axis=0)):
+                found.append(
+                    f"{names[site]}: {values[first].real / samples.origin.scale:g} from t = {samples.t[rows[first]]:g} "
+                    f"to {samples.t[rows[last - 1]]:g}, while others move; if it had stopped, leave these cells empty"
+                )
+    return found
+
+
+def _range(values: ndarray) -> float:
+    """Return by how much the real parts of readings differ; 0 where there are none."""
+    seen = values.real[np.isfinite(values)]
+    return float(np.ptp(seen)) if len(seen) else 0.0
 
 
 def strays(samples: Samples) -> list[str]:
@@ -100,6 +151,8 @@ def notes(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
     for samples in _joined(diagnosis.data):
+        for line in (*degrees(samples, diagnosis.before.model.declared), *resting(samples)):
+            yield f"{samples.source}: {line}."
         yield from strays(samples)
         yield from turns(samples)
         yield from _clipped(samples)

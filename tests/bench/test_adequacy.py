@@ -11,6 +11,7 @@ from latticebench import methods
 from latticebench.bench import adequacy as judge
 from latticebench.bench.adequacy import adequacy
 from latticebench.bench.fitting import FitCase, samples
+from latticebench.bench.noise import left_by
 from latticebench.methods.method import Fit, make, solve
 from latticebench.systems import find
 from latticebench.systems.lattice import library
@@ -90,6 +91,26 @@ def test_the_right_coefficients_fit_at_any_noise_and_half_of_one_is_told_where_i
 
     assert fits(truth)
     assert not fits(wrong) or noise == 0.1
+
+
+@pytest.mark.parametrize("name", ["phi4", "sine-gordon", "ginzburg-landau"])
+def test_readings_without_noise_do_not_contradict_the_equation_that_made_them(name):
+    system = find(name)
+    equation = system.library("equation")
+    data = [simulate(system, times=sample_times(50, 10.0)).observed()]
+    found = solve(make(methods.find("trajectory"), {}), data, equation, system.order, 1)
+    quality = adequacy(data, found)
+    assert quality.fits, quality.warnings
+    assert left_by(data, found).warning == ()
+    fewer = library("fewer", equation.texts[:-1])
+    assert not adequacy(data, solve(make(methods.find("trajectory"), {}), data, fewer, system.order, 1)).fits
+
+
+def test_what_readings_without_noise_say_of_it_is_that_there_is_none():
+    t = np.linspace(0.0, 20.0, 400)
+    data = [Samples(t, np.column_stack([np.cos(t), np.sin(t)]), ends="free")]
+    found = solve(make(methods.find("trajectory"), {}), data, library("one", "u[n]"), 2, 1)
+    assert "the readings have no noise" in adequacy(data, found).in_words
 
 
 def test_a_motion_that_runs_away_and_a_sensor_that_rests_are_no_obstacle():

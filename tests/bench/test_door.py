@@ -12,6 +12,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.bench.cli import main
+from latticebench.bench.report.notes import resting
+from latticebench.systems.samples import Samples
 
 READING = ["--time", "time_s", "--columns", "theta_*_deg", "--scale", "deg"]
 MODEL = ["--terms", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])", "--order", "2", "--ends", "free"]
@@ -200,3 +202,31 @@ def test_a_force_far_above_the_chains_own_frequencies_may_be_hum_and_the_report_
     found = json.loads(typed("diagnose", "hum.csv", *words)[0])
     assert {one["effect"] for one in found["effects"]} == {"drive", "damping"}
     assert any("hum that a sensor picks up" in line for line in found["notes"]) == told
+
+
+def test_a_sensor_that_stops_is_pointed_at_and_one_that_still_waits_or_came_to_rest_with_all_is_not() -> None:
+    t = np.arange(0, 40, 0.1)
+    u = np.column_stack([np.cos(t), np.sin(1.3 * t), np.cos(0.7 * t)])
+    stopped = u.copy()
+    stopped[200:, 1] = 0.25
+    (line,) = resting(Samples(t, stopped))
+    assert line == "u2: 0.25 from t = 20 to 39.9, while others move; if it had stopped, leave these cells empty"
+    waits, rests, dead = (u.copy() for _ in range(3))
+    waits[:200, 1] = 0.0
+    rests[200:] = u[200]
+    dead[:, 2] = 12.5
+    assert resting(Samples(t, u)) == resting(Samples(t, waits)) == resting(Samples(t, rests)) == []
+    assert resting(Samples(t, dead)) == ["u3: always 12.5; does this sensor work?"]
+
+
+@pytest.mark.slow
+def test_a_diagnosis_points_at_degrees_in_a_sine_and_at_a_sensor_that_stopped(typed: Typed, tmp_path: Path) -> None:
+    t = np.arange(0, 20, 0.05)
+    u = np.column_stack([20 * np.cos(2 * t), 15 * np.sin(2 * t)])
+    u += 0.05 * np.random.default_rng(2).normal(size=u.shape)
+    u[200:, 1] = 12.5
+    np.savetxt(tmp_path / "d.csv", np.column_stack([t, u]), "%.3f", ",", header="t,u1,u2", comments="")
+    words = ["--terms", "sin(u[n])", "--order", "2", "--ends", "free", "--json", "-"]
+    notes = " ".join(json.loads(typed("diagnose", "d.csv", *words)[0])["notes"])
+    assert "in sin(...), which takes radians; if these are degrees: --scale deg." in notes
+    assert "u2: 12.5 from t = 10 to 19.95, while others move" in notes

@@ -222,6 +222,19 @@ def test_an_angle_that_starts_anew_goes_on_once_its_turn_is_told(start, steps):
     np.testing.assert_allclose(told - told[0], np.outer(angle - angle[0], [1, -1]), atol=1e-7)
 
 
+@given(
+    turns=st.lists(st.integers(-3, 3), min_size=4, max_size=4),
+    rests=st.lists(st.floats(-80, 80), min_size=4, max_size=4),
+)
+def test_neighbours_are_less_than_half_a_turn_apart_whatever_turn_each_was_read_in(turns, rests):
+    t = np.linspace(0, 3, 31)
+    angles = np.array(rests) + 40 * np.sin(np.outer(t, [1, 2, 3, 4]))
+    read_as = (angles + 360 * np.array(turns)) % 360.0
+    read_as[:4, 1] = np.nan
+    told = unwrapped(read_as, 360.0, "file")
+    assert np.nanmax(np.abs(np.diff(told - angles - (told - angles)[:, :1], axis=1))) < 1e-7
+
+
 @pytest.mark.parametrize(("head", "unit"), [("u1", ""), ("u1 [deg]", " deg")])
 def test_angles_that_are_unwrapped_are_told_with_their_turn_in_the_unit_of_the_file(tmp_path, head, unit):
     path = written(tmp_path, f"t,{head}\n0,350\n1,10\n")
