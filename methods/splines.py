@@ -128,9 +128,9 @@ class Splines:
         if path:
             seconds, score, followed = map(np.array, zip(*path, strict=True))
             history = History(np.arange(1, len(path) + 1), seconds, score, followed)
-        residual = float(np.sqrt(best.misfit[0] / max(scale.counts[0], 1)) / max(scale.height[0], 1e-300))
         return Fit(
-            self.name, library, order, best.coefficients, residual, stderr=np.sqrt(np.diag(best.covariance)),
+            self.name, library, order, best.coefficients, _left(curves, best, order),
+            stderr=np.sqrt(np.diag(best.covariance)),
             status="ok" if best is not start else "the fit did not converge; its start is given",
             history=history, found=found, smooth=tuple(map(_smooth, curves, best.splines)),
         )  # fmt: skip
@@ -244,6 +244,16 @@ def _score(misfit: ndarray, used: ndarray, scale: _Scale) -> float:
     share = used / scale.counts
     parts = np.log(np.maximum(misfit, scale.floor**2) / (1 - share) ** 2) + np.log(ROBUST + (1 - ROBUST) * share)
     return float(np.sum(scale.counts * parts) / np.sum(scale.counts))
+
+
+def _left(curves: Sequence[Curves], stage: _Stage, order: int) -> float:
+    """Return the RMS of what the equation leaves of the highest derivative of the splines, over that of this."""
+    missed = objective(curves, stage.splines, stage.coefficients, stage.sigma, stage.weight)[2]
+    whole = 0.0
+    for one, splines in zip(curves, stage.splines, strict=True):
+        rate = one.fields(splines, order)[order][..., one.record.stretches.dynamics.moving]
+        whole += float(np.sum(one.measure[:, None, None] * rate**2))
+    return float(np.sqrt(missed / whole if whole > 0 else missed))
 
 
 def _smooth(curves: Curves, splines: ndarray) -> Smooth:

@@ -127,6 +127,21 @@ def test_prose_stands_in_lines_of_120_characters() -> None:
         assert not [line for line in lines if len(line) > MOST_CHARACTERS and not line.lstrip().startswith("|")], name
 
 
+# What gathers something while a run lasts.
+GATHERING = {"_Sums", "Batches", "_Station", "Leases", "Presence", "Lines", "Tally"}
+
+
+def test_every_dataclass_is_frozen_but_those_that_gather() -> None:
+    thawed = {
+        node.name
+        for tree in TREES.values() for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+        for one in map(ast.unparse, node.decorator_list)
+        if one.startswith(("dataclass", "dataclasses.dataclass")) and "frozen=True" not in one
+    }  # fmt: skip
+    assert thawed == GATHERING
+
+
 def test_every_package_is_listed_for_the_wheel() -> None:
     tomllib = pytest.importorskip("tomllib", reason="Python 3.10 cannot read TOML")
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]

@@ -36,11 +36,12 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 ROOMS = ("systems", "methods", "diagnosis", "bench")
 # What every method is asked.
-CONTRACT = "methods/test_contract.py"
+CONTRACT = "methods/test_contract.py test_house.py"
 # Modules, with the tests that are nearest and those that are near.
 MODULES = {
-    "bench/score.py": ("bench/test_score.py", "bench/test_fitting.py bench/test_run.py"),
-    "bench/case.py": ("bench/test_fitting.py bench/test_suite.py", "bench/test_store.py bench/test_run.py"),
+    "bench/score.py": ("bench/test_score.py", "bench/test_fitting.py bench/test_run.py test_house.py"),
+    "bench/case.py": (
+        "bench/test_fitting.py bench/test_suite.py", "bench/test_store.py bench/test_run.py test_house.py"),
     "bench/limit.py": ("bench/test_limit.py", "bench/test_door.py"),
     "bench/compare.py": ("bench/test_compare.py", "bench/test_cli.py bench/trials/test_judging.py"),
     "bench/store.py": ("bench/test_store.py", "bench/test_run.py bench/test_full.py bench/test_choice.py"),
@@ -60,7 +61,7 @@ MODULES = {
         "methods/engine/test_sensitivity.py methods/engine/test_shooting.py", f"methods/test_trajectory.py {CONTRACT}"),
     "methods/engine/shooting.py": (
         "methods/engine/test_shooting.py methods/test_trajectory.py", f"bench/test_limit.py {CONTRACT}"),
-    "methods/trajectory.py": ("methods/test_trajectory.py", CONTRACT),
+    "methods/trajectory.py": ("methods/test_trajectory.py", f"methods/test_windows.py {CONTRACT}"),
     "methods/engine/collocation.py": (
         "methods/engine/test_collocation.py methods/engine/test_spline_state.py",
         f"methods/test_splines.py methods/test_pielm.py {CONTRACT}"),
@@ -81,6 +82,11 @@ EQUAL: dict[str, str] = {
     'return value if math.isfinite(value) else ("inf" if value >= 0 else "-inf")': "an infinite number is not 0",
     "positive = d[d > 1e-12 * d[- 0]]": "-0 is 0",
     "HOPELESS, TRIED = 10**9, 11**5": "another bound on what is tried",
+    "needed[open_] *= 3": "more steps than are needed",
+    "alike = np.flatnonzero(substeps >= number)": "what needs more steps is done again with more",
+    "target[:, -1] = np.transpose(product, (2, 1, 0)).reshape(target[:, ~1].shape)": "another place of the same shape",
+    "return Abilities(missing=True, motion=True, memory= 2501, window=WIDE, loads=LOADS)": "an estimate of memory",
+    "yield from (list(some) for some in _batched(cut(samples, library.reach), max(1, WIDE + WINDOW)))": "other batches",
     'if not {"results", "origins", "suite", "about"} < names:': "a store has further tables",
     "rows, seen = (*self.rows, piece), self.seen ^ len(piece.target)": "another seed of a draw",
     "points = slice(int(some[0]), int(some[-1]) // 1)": "a test function is nearly 0 at the last of its points",

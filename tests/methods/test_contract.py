@@ -19,6 +19,7 @@ from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.samples import Samples, SimulatedSamples
 from latticebench.systems.simulate import observe, sample_times, simulate
+from latticebench.systems.stencil import evaluate
 
 # Settings that make a slow method fast enough for a test; what it finds is not judged here.
 QUICK = {
@@ -306,3 +307,35 @@ def test_a_method_that_the_memory_does_not_suffice_for_says_so_before_it_starts(
     with pytest.raises(Skipped, match=r"1.1e\+08 GiB for 60 values and 2 terms.* piece by piece"):
         solve(Hungry(), data, library("own", "u[n]; u[n]**3"), 2, 1)
     assert "piece" not in obstacle(Abilities(memory=1.0), data, library("own", "u[n]"))
+
+
+# Methods whose residual is not that of a differentiated equation.
+OTHERWISE = {name for name in METHODS if methods.find(name)().abilities.motion} | {"zero", "oracle", "pinn"}
+
+
+@pytest.mark.parametrize("name", sorted(set(METHODS) - OTHERWISE))
+@pytest.mark.parametrize("system", ["phi4", "dnls"])
+def test_the_residual_is_the_share_of_the_derivative_that_an_equation_leaves_which_lacks_a_term(
+    name: str, system: str
+) -> None:
+    found = systems.find(system)
+    clean = simulate(found, sites=11, times=sample_times(41, 8.0), integrator="dop853")
+    fewer = library("fewer", found.library("equation").texts[:-1])
+    fit = solve(make(methods.find(name), {}), [clean], fewer, found.order, seed=3)
+    values = evaluate(fewer.terms, clean.exact.u, clean.exact.v, None, clean.t, ends="unknown")
+    rate = split_parts(clean.rate[:, 1:-1], clean.is_complex).swapaxes(0, 1)
+    wanted = rate - np.tensordot(fit.coefficients, values, (0, 1))
+    assert fit.residual == pytest.approx(np.linalg.norm(wanted) / np.linalg.norm(rate), rel=0.3)
+
+
+@pytest.mark.parametrize("data", ["phi4", "dnls"])
+@pytest.mark.parametrize("name", [name for name in METHODS if methods.find(name)().abilities.motion])
+def test_the_residual_of_a_motion_is_its_share_of_the_readings(
+    name: str, data: str, request: pytest.FixtureRequest, fitted: Fitted
+) -> None:
+    samples, fit = request.getfixturevalue(data), fitted(name, data)
+    if isinstance(fit, str):
+        return
+    assert fit.motion is not None
+    left = np.linalg.norm(fit.motion[0].u - samples.u)
+    assert fit.residual == pytest.approx(left / np.linalg.norm(samples.u), rel=1e-3)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from latticebench import systems
+from latticebench.bench.published import read_head
 from latticebench.methods.engine.inputs import inputs
-from latticebench.methods.method import make, solve
+from latticebench.methods.method import make, settings, solve
 from latticebench.methods.pielm import PIELM
 from latticebench.methods.pinn import PINN
 from latticebench.systems.errors import InputError
@@ -25,6 +28,18 @@ def oscillators(sites: int = 3) -> tuple[Samples, np.ndarray]:
     w = np.sqrt(2)
     u = amplitude * np.cos(w * t[:, None] + phase)
     return Samples(t, u, -w * amplitude * np.sin(w * t[:, None] + phase)), np.array([-2.0, 0.0])
+
+
+def test_the_network_is_the_papers_and_is_trained_as_the_published_tables_say():
+    made = read_head(Path(__file__).parents[2] / "results" / "default" / "cases.csv")["settings"]
+    (told,) = [one for one in made.split("; ") if one.startswith("pinn pinn,")]
+    assert told == "pinn pinn, " + ", ".join(f"{name}={value}" for name, value in settings(PINN).items())
+    assert "layers=3, width=40" in told
+
+
+def test_torch_is_loaded_for_a_device_alone():
+    assert PINN().abilities.loads == ()
+    assert PINN(device="cpu:0").abilities.loads == ("torch",)
 
 
 def test_a_short_fit_finds_an_oscillator():
