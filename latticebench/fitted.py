@@ -48,7 +48,7 @@ class Residual:
         >>> data = lb.read((t, np.cos(1.5 * t) + noise))
         >>> left = lb.fit(data, lb.Model("u[n]", ends="free")).residual
         >>> left
-        Residual(arrays: 0.0085 in the mean square, ... times the noise)
+        Residual(arrays: 0.0085 as root mean square, ... times the noise)
         >>> left.to_frame().shape
         (100, 2)
         >>> left.plot()
@@ -89,7 +89,7 @@ class Residual:
     def __repr__(self) -> str:
         unit = f" {self.overlay.unit}" if self.overlay.unit else ""
         noise = "" if np.isnan(self.times) else f", {self.times:.2g} times the noise"
-        return f"Residual({self.overlay.source}: {self.rms:.2g}{unit} in the mean square{noise})"
+        return f"Residual({self.overlay.source}: {self.rms:.2g}{unit} as root mean square{noise})"
 
     def _repr_html_(self) -> str:
         return f"<p>{html.escape(repr(self))}</p>{html_table(self.to_frame().drop(columns='t').describe(), index=True)}"

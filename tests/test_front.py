@@ -98,7 +98,7 @@ def test_a_fit_leaves_a_residual_that_can_be_drawn_in_the_unit_of_the_file():
     left = found.residual
     assert left.rms == pytest.approx(0.1, rel=0.3)
     assert left.times == pytest.approx(1, abs=0.4)
-    assert "deg in the mean square" in repr(left)
+    assert "deg as root mean square" in repr(left)
     np.testing.assert_allclose(left.to_frame()["u1"], left.values[:, 0])
     labels = {axes.get_xlabel() for axes in left.plot().figure.axes}
     assert labels == {"t / s", "angular frequency / (rad/s)"}

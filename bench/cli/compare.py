@@ -16,6 +16,9 @@ from latticebench.systems.files import shown
 if TYPE_CHECKING:
     from latticebench.bench.against import Contest
 
+# Cases that only one of two runs has, of which so many are named.
+LISTED = 20
+
 EPILOG = (
     "Example:  latticebench compare results/default runs/default\n\n"
     "Methods:  latticebench compare runs/mine --with results/paper --against stlsq --out ranks.pdf"
@@ -71,10 +74,11 @@ def _compare_runs(old: Path, new: Path, factor: float, as_json: bool) -> None:
         for name, frame in (("loss", found.worse), ("gain", found.better)):
             for _, row in frame.iterrows():
                 print(printable(f"{name}: {row['case']}: {row['old']} -> {row['new']}"))
-        for name in found.gone:
-            print(printable(f"gone: {name}"))
-        for name in found.fresh:
-            print(printable(f"new: {name}"))
+        for word, names in (("gone", found.gone), ("new", found.fresh)):
+            for name in names[:LISTED]:
+                print(printable(f"{word}: {name}"))
+            if len(names) > LISTED:
+                print(f"{word}: {len(names) - LISTED} more cases")
         for _, row in found.methods.iterrows():
             told = f"{row['pairs']} pairs, median ratio {row['ratio']:.3g}, p = {row['p']:.2g}"
             print(printable(f"{row['verdict']}: {row['method']} ({told})"))

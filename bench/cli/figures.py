@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from latticebench.bench.beside import Published
     from latticebench.bench.store import Store
 
-# Endings of files with which no folder is meant.
-ENDINGS = (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".gif")
-
 EPILOG = "Example:  latticebench figures runs/default --out results/default"
 
 
@@ -47,7 +44,8 @@ def figures(
     kinds.check_figures(only)
     store = open_store(folder)
     published = None if beside is None else read_published(beside)
-    if out is not None and out.suffix.lower() in ENDINGS:
+    # With an ending of letters no folder is meant, unless there is one.
+    if out is not None and out.suffix[1:].isalpha() and not out.is_dir():
         files = [_draw_one(store, out, only, published)]
     else:
         drawn = folder / "figures" if out is None else out

@@ -231,7 +231,8 @@ def _tell_hours(suite: str, cases: Sequence[Case], jobs: int, yes: bool) -> None
     if not yes:
         check_hours(most, suite)
     if most > TOLD_HOURS:
-        print(f"{shown(suite)}: at most {most:.0f} hours, if every case needs all of its time limit", file=sys.stderr)
+        told = f"{most:.0f} hour{'s' * (round(most) != 1)}"
+        print(f"{shown(suite)}: at most {told}, if every case needs all of its time limit", file=sys.stderr)
 
 
 def shard_of(text: str | None, cases: int) -> Shard:

@@ -75,16 +75,16 @@ def with_unit(value: str, unit: str) -> str:
 
 def of_natural(name: str, units: Units) -> tuple[float, str]:
     """Return the factor and the unit of an effect's number in its natural form, by its name."""
-    if name.startswith("offset of "):
+    if name.startswith(("offset of ", "drift of ")):
         return 1 / units.scale, units.reading
     return 1.0, units.time if name.endswith("time") else ""
 
 
 def in_sentence(line: str, units: Units) -> str:
-    """Return a sentence about an effect with its offset, or its time, in the units of the recording."""
-    offset = re.fullmatch(r"(offset of \w+): (\S+)", line)
-    if offset:
-        return f"{offset[1]}: {with_unit(f'{float(offset[2]) / units.scale:.{DIGITS}g}', units.reading)}"
+    """Return a sentence about an effect with its offset or drift, or its time, in the units of the recording."""
+    zero = re.fullmatch(r"((?:offset|drift) of \w+): (\S+)(.*)", line)
+    if zero:
+        return f"{zero[1]}: {with_unit(f'{float(zero[2]) / units.scale:.{DIGITS}g}', units.reading)}{zero[3]}"
     return with_unit(line, units.time) if re.search(r" within [\d.e+-]+$", line) else line
 
 

@@ -54,6 +54,8 @@ def test_the_headline_is_what_the_paired_tests_say(script: Callable[[str], Modul
     assert [best["verdict"], own["verdict"], wide["verdict"]] == ["pinn-gn better", UNDECIDED, "pinn-gn better"]
     assert all(table.loc[(*place, "trajectory"), "beside it"] == UNDECIDED for place in noisy)
     follows = table.loc[(*clean[0], "trajectory")]
+    seconds = table["cpu seconds"].unstack()
+    slower = seconds["pinn-gn"] / seconds["trajectory"]
     assert follows["beside it"] == "better"
     for told in (
         f"{best['wins']} of the {best['cases']} lattices and libraries",
@@ -62,6 +64,7 @@ def test_the_headline_is_what_the_paired_tests_say(script: Callable[[str], Modul
         f"(ratio {format_number(wide['ratio'])}, p = {format_number(wide['p'])})",
         f"({own['wins']} won, {own['losses']} lost, p = {format_number(own['p'])})",
         f"(ratio {format_number(follows['ratio'])}, p = {format_number(follows['p'])})",
+        f"`pinn-gn` takes {slower.min():.2g} to {slower.max():.2g} times as long as `trajectory`",
     ):
         assert told in text
 
