@@ -14,6 +14,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import sys
+from collections.abc import Iterable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,15 @@ SYSTEMS = "latticebench.systems"
 def brought(group: str) -> dict[str, EntryPoint]:
     """Return what packages bring, METHODS or SYSTEMS, by name; of two of one name the first that Python finds."""
     return dict(_brought(group, tuple(sys.path)))
+
+
+def hidden(group: str, own: Iterable[str]) -> dict[str, str]:
+    """Return by its name why something that a package brings cannot be used: the name is one of our `own`."""
+    entries = brought(group)
+    return {
+        name: f"{package(entries[name])}: not used, since latticebench has {name!r} itself; it needs another name"
+        for name in own if name in entries
+    }  # fmt: skip
 
 
 @functools.lru_cache(maxsize=16)

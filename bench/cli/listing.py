@@ -38,6 +38,7 @@ def list_(
 
 def _system_rows() -> list[dict[str, Any]]:
     from latticebench import systems
+    from latticebench.systems import packages
 
     rows: list[dict[str, Any]] = []
     for name in [*systems.names(), *systems.brought()]:
@@ -54,7 +55,8 @@ def _system_rows() -> list[dict[str, Any]]:
                 "source": system.source,
             }
         )  # fmt: skip
-    return rows
+    taken = packages.hidden(packages.SYSTEMS, systems.names())
+    return [*rows, *({**dict.fromkeys(rows[0], ""), "name": name, "source": why} for name, why in taken.items())]
 
 
 def _library_rows() -> list[dict[str, Any]]:
@@ -88,6 +90,7 @@ def _sound_systems() -> list[str]:
 def _method_rows() -> list[dict[str, Any]]:
     from latticebench import methods
     from latticebench.methods.method import settings
+    from latticebench.systems import packages
 
     rows = []
     for name in [*methods.registered(), *methods.brought()]:
@@ -100,7 +103,8 @@ def _method_rows() -> list[dict[str, Any]]:
         values = {key: list(value) if isinstance(value, tuple) else value for key, value in settings(kind).items()}
         about = (kind.__doc__ or "").strip().splitlines()[0]
         rows.append({"name": name, "what it is": about, "settings": values})
-    return rows
+    taken = packages.hidden(packages.METHODS, methods.registered())
+    return [*rows, *({"name": name, "what it is": why, "settings": {}} for name, why in taken.items())]
 
 
 def _effect_rows() -> list[dict[str, Any]]:

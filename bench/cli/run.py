@@ -122,8 +122,8 @@ def _run(suite: Suite, store: Store, executor: Executor, part: Shard, retry: boo
             return run_suite(suite, store, executor=executor, retry=retry, shard=part, watcher=watcher, about=about)[1]
     except KeyboardInterrupt:
         print(
-            f"stopped; {len(store.results())} results are in {shown(store.path.parent)}; the same command continues "
-            "from there",
+            f"stopped; {len(store.results())} results are in {shown(store.path.parent)}, which `latticebench table` "
+            "shows; the same command continues from there",
             file=sys.stderr,
         )
         raise

@@ -146,3 +146,10 @@ def test_a_changed_module_of_the_package_runs_its_cases_again(site: Path, tmp_pa
 def test_without_other_packages_there_is_nothing_brought() -> None:
     assert not set(methods.brought()) & set(methods.registered())
     assert not set(systems.brought()) & set(systems.names())
+
+
+def test_what_has_a_name_of_ours_is_listed_as_not_used(site: Path, tmp_path: Path) -> None:
+    rows = json.loads(succeed("list", "methods", "--json", cwd=tmp_path))["rows"]
+    ours, theirs = [row["what it is"] for row in rows if row["name"] == "zero"]
+    assert theirs == "package broken 1.2: not used, since latticebench has 'zero' itself; it needs another name"
+    assert "package" not in ours
