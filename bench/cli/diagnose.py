@@ -13,7 +13,7 @@ import typer
 from latticebench.bench.cli.arguments import asked, kept
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, check_places, complete_systems, place
 from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, Turn, layout_of, read_told
-from latticebench.systems.errors import InputError
+from latticebench.systems.errors import InputError, printable
 
 if TYPE_CHECKING:
     from latticebench.bench.report.content import Report
@@ -68,6 +68,7 @@ def diagnose(
 ) -> None:
     """Find what a declared equation lacks: trace its residual to an effect, add it, show the error before and after."""
     from latticebench.bench import calls
+    from latticebench.bench.report.notes import degrees, resting
     from latticebench.bench.report.screen import watching
     from latticebench.systems.readers import read_all
 
@@ -79,6 +80,8 @@ def diagnose(
     _check_field(known, data)
     # Read together, since the two must be of the same chain.
     later = read_all([*files, *holdout], ends, layout)[len(data) :] if holdout else []
+    for line in dict.fromkeys(line for one in data for line in (*degrees(one, declared), *resting(one))):
+        print(printable(f"Warning: {line}."), file=sys.stderr)
     with watching() as watcher, redirect_stdout(sys.stderr):
         found, report = calls.diagnose(data, declared, order, effects=effects, later=later, watcher=watcher)
     _report(found, report, json_out, html_out)

@@ -227,6 +227,10 @@ def test_a_diagnosis_points_at_degrees_in_a_sine_and_at_a_sensor_that_stopped(ty
     u[200:, 1] = 12.5
     np.savetxt(tmp_path / "d.csv", np.column_stack([t, u]), "%.3f", ",", header="t,u1,u2", comments="")
     words = ["--terms", "sin(u[n])", "--order", "2", "--ends", "free", "--json", "-"]
-    notes = " ".join(json.loads(typed("diagnose", "d.csv", *words)[0])["notes"])
+    told, err = typed("diagnose", "d.csv", *words)
+    assert err.startswith(
+        "Warning: u reaches 20.1 in sin(...), which takes radians; if these are degrees: --scale deg."
+    )
+    notes = " ".join(json.loads(told)["notes"])
     assert "in sin(...), which takes radians; if these are degrees: --scale deg." in notes
     assert "u2: 12.5 from t = 10 to 19.95, while others move" in notes
