@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from latticebench.diagnosis.fitting import Fitted
     from latticebench.diagnosis.repair import Diagnosis
 
+# A model that leaves less than so many times the noise comes down to it.
+REACHED = 1.05
 Verdict = Literal["nothing missing", "explained", "partly explained", "unexplained"]
 
 
@@ -222,6 +224,8 @@ def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
     lost = NOT_REACHED in shortfalls(diagnosis)
     if len(rivals) < len(diagnosis.left):
         size = "" if lost else f"; in all, the model leaves {diagnosis.residual[1]:.3g} times the noise"
+        if diagnosis.residual[1] < REACHED:
+            size = "; it is small, since the model comes down to the noise"
         said.append(f"Something more is left that nothing in the catalogue explains{size}.")
     elif not rivals:
         them = "it" if len(names) == 1 else "them"
