@@ -18,6 +18,7 @@ import pytest
 from latticebench import methods
 from latticebench.bench.cli import main
 from latticebench.bench.demo import write_recording
+from latticebench.bench.grid import Grid
 from latticebench.bench.published import read_head
 
 ROOT = Path(__file__).parent.parent
@@ -142,3 +143,9 @@ def test_the_result_that_the_readme_shows_is_the_published_one() -> None:
 
 def test_the_readme_has_at_most_600_words() -> None:
     assert len(re.sub(r"<!--.*?-->", "", README, flags=re.DOTALL).split()) <= 600
+
+
+def test_the_page_on_methods_explains_every_key_of_a_grid() -> None:
+    table = PAGES["method"][PAGES["method"].index("| keys of a grid") :]
+    explained = set(re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in table.splitlines() if "|" in line)))
+    assert set(Grid.model_fields) <= explained
