@@ -37,7 +37,7 @@ FEW = 40
 SETTINGS = ("noise", "seed", "sites", "z")
 MOST_FILTERS = 6
 LABELS = {
-    "data": "setting", "e2": "E2", "einf": "Einf", "tpr": "support", "e2_low": "E2, 10 %", "e2_high": "E2, 90 %",
+    "data": "setting", "e2": "E2", "einf": "Einf", "tpr": "support", "e2_low": "E2, low", "e2_high": "E2, high",
     "forecast_error": "forecast error", "forecast_horizon": "forecast horizon", "cpu_seconds": "CPU seconds",
     "peak_mib": "peak MiB", "ok": "fits that ended", "seeds": "number of seeds",
 }  # fmt: skip

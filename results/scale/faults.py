@@ -5,7 +5,8 @@
 Each fault strikes at so many random moments (50 if not given) of a run of naps: cases that write a line into a diary,
 sleep for a twentieth of a second and fit nothing. What had its result in the store at any moment has to be there at the
 end, and once. Where a fault ends the run, the same command is typed again. Processes are known by a mark in their
-environment; those that are there a minute after the last run are left over.
+environment; those that are there a minute after the last run are left over. Faults that are named are played anew; the
+rows of the others stay as they are.
 """
 
 from __future__ import annotations
@@ -39,8 +40,9 @@ from latticebench.systems.files import write_text
 HERE = Path(__file__).parent
 MARK = "LATTICEBENCH_FAULTS"
 SEED = 1
-# Naps for each moment, and seconds between two moments and to wait for what must happen.
-NAPS, BETWEEN, PATIENCE = 40, (0.3, 2.5), 300.0
+# Naps for each moment, more where a fault costs little time, and seconds between two moments and to wait for what must
+# happen.
+NAPS, MANY, BETWEEN, PATIENCE = 40, 100, (0.3, 2.5), 300.0
 # Seconds that a worker stands still or hears nothing; every so manieth time it is a minute.
 STILL, MINUTE_EVERY = (0.2, 3.0), 25
 LOCAL = ("--cluster", "local:2")
@@ -94,6 +96,7 @@ class Stage:
 
     folder: Path
     moments: int
+    naps: int
     eaters: int = 0
     mark: str = field(default_factory=lambda: uuid.uuid4().hex)
     draw: random.Random = field(default_factory=lambda: random.Random(SEED))
@@ -104,7 +107,7 @@ class Stage:
 
     def __post_init__(self) -> None:
         (self.folder / "nap.py").write_text(METHODS)
-        labels = {"nap": NAPS * self.moments, "eater": self.eaters}
+        labels = {"nap": self.naps * self.moments, "eater": self.eaters}
         text = 'title = "naps"\n'
         for label, count in labels.items():
             given = f'diary = "{self.folder / "diary"}", eats = {str(label == "eater").lower()}'
@@ -115,7 +118,7 @@ class Stage:
     @property
     def cases(self) -> int:
         """How many cases the suite has."""
-        return NAPS * self.moments + self.eaters
+        return self.naps * self.moments + self.eaters
 
     @property
     def diary(self) -> list[str]:
@@ -385,7 +388,127 @@ def played(names: list[str], moments: int) -> Iterator[dict[str, object]]:
     for name in names:
         fault, began = FAULTS[name], time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
-            stage = Stage(Path(folder).resolve(), moments, eaters=moments if fault is memory_exceeded else 0)
+            naps, eaters = MANY if fault in (worker_hangs, network_lost) else NAPS, moments * (fault is memory_exceeded)
+            stage = Stage(Path(folder).resolve(), moments, naps, eaters)
+            fault(stage)
+            final = stage.finished()
+            with suppress(TimeoutError):
+                end = time.monotonic() + 60.0
+                _wait_for(lambda stage=stage, end=end: not stage.marked() or time.monotonic() > end)  # type: ignore[misc]
+            left = stage.marked()
+            for one in left:
+                one.kill()
+            yield {
+                "fault": name, "what": (fault.__doc__ or "").strip(), "struck": len(stage.struck), "cases": stage.cases,
+                "finished at the first": min(stage.struck, default=0), "at the last": max(stage.struck, default=0),
+                "lost": len(stage.seen - set(final)), "twice": len(final) - len(set(final)),
+                "never run": stage.cases - len(set(final)), "begun again": len(stage.diary) - stage.cases,
+                "left over": len(left), "exit codes": " ".join(f"{code}: {stage.codes.count(code)}" for code in
+                sorted(set(stage.codes))), "seconds": round(time.monotonic() - began),
+            }  # fmt: skip
+
+
+def page(table: pd.DataFrame) -> str:
+    """Return the text of faults.md, without its provenance."""
+    told = "\n".join(f"- *{row.fault}*: {row.what}" for row in table.itertuples())
+    about = (__doc__ or "").split("[FAULT ...]]\n")[1].strip()
+    return (
+        f"# What breaks while a run lasts, and what is lost\n\n{about}\n\n"
+        f"{markdown_table(table.drop(columns='what').astype(str))}\n\n"
+        "`finished` is how many cases had their results when the fault struck; `begun again` counts cases whose first "
+        "run was broken off, or whose result was not kept; exit codes are those of the runs, with how many there were "
+        f"of each (negative: the signal).\n\n{told}"
+    )
+
+
+def main() -> None:
+    """Break runs, and write the two files."""
+    moments = int(sys.argv[1]) if len(sys.argv) > 1 else 50
+    names, path = sys.argv[2:] or list(FAULTS), HERE / "faults.csv"
+    about = {"command": " ".join(["python results/scale/faults.py", *sys.argv[1:]]), **origin(), "seed": SEED}
+    kept = pd.read_csv(path, comment="#") if sys.argv[2:] and path.exists() else pd.DataFrame()
+    rows = {str(row["fault"]): row for row in kept.to_dict("records")}
+    for row in played(names, moments):
+        rows[str(row["fault"])] = {**row, "commit": about["commit"]}
+        print(row, flush=True)
+        table = pd.DataFrame([rows[name] for name in FAULTS if name in rows])
+        write_text(path, render(table, about, "csv"))
+        provenance = "".join(f"{line}\n" for line in markdown_list(lines(about)))
+        write_text(HERE / "faults.md", f"{page(table)}\n\n{provenance}")
+
+
+if __name__ == '__main__':\n    from distributed.cli.dask_{part} import main; main()"
+    return sys.executable, "-c", program
+
+
+def _scheduler(stage: Stage) -> tuple[str, subprocess.Popen[bytes]]:
+    told = stage.folder / f"scheduler-{uuid.uuid4().hex}.json"
+    process = stage.start(
+        *_dask("scheduler"), "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(told)
+    )
+    _wait_for(lambda: told.is_file() and told.stat().st_size > 0)
+    return json.loads(told.read_text())["address"], process
+
+
+class Silence:
+    """A way to a scheduler and one to a worker, over which at times nothing gets.
+
+    Attributes:
+        port: where a worker finds the scheduler.
+        ports: where a worker has to listen, and where others find it.
+    """
+
+    def __init__(self, scheduler: int) -> None:
+        self.open, self.port, self.ports = threading.Event(), 0, (0, 0)
+        self.open.set()
+        ready = threading.Event()
+        threading.Thread(target=lambda: asyncio.run(self._serve(scheduler, ready)), daemon=True).start()
+        ready.wait(PATIENCE)
+
+    def keep(self, seconds: float) -> None:
+        """Let nothing pass for some seconds."""
+        self.open.clear()
+        time.sleep(seconds)
+        self.open.set()
+
+    async def _serve(self, scheduler: int, ready: threading.Event) -> None:
+        free = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
+        own = free.sockets[0].getsockname()[1]
+        free.close()
+        ways = [await asyncio.start_server(self._way_to(port), "127.0.0.1", 0) for port in (scheduler, own)]
+        self.port, seen = (way.sockets[0].getsockname()[1] for way in ways)
+        self.ports = own, seen
+        ready.set()
+        await asyncio.gather(*(way.serve_forever() for way in ways))
+
+    def _way_to(self, port: int) -> Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]:
+        async def pass_on(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> None:
+            with suppress(OSError):
+                while piece := await source.read(65536):
+                    while not self.open.is_set():
+                        await asyncio.sleep(0.01)
+                    target.write(piece)
+                    await target.drain()
+            target.close()
+
+        async def meet(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            try:
+                back, forth = await asyncio.open_connection("127.0.0.1", port)
+            except OSError:
+                writer.close()
+                return
+            await asyncio.gather(pass_on(reader, forth), pass_on(back, writer))
+
+        return meet
+
+
+def played(names: list[str], moments: int) -> Iterator[dict[str, object]]:
+    """Yield what each fault did."""
+    for name in names:
+        fault, began = FAULTS[name], time.monotonic()
+        with tempfile.TemporaryDirectory() as folder:
+            naps, eaters = MANY if fault in (worker_hangs, network_lost) else NAPS, moments * (fault is memory_exceeded)
+            stage = Stage(Path(folder).resolve(), moments, naps, eaters)
             fault(stage)
             final = stage.finished()
             with suppress(TimeoutError):
