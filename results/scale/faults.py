@@ -23,10 +23,11 @@ import tempfile
 import threading
 import time
 import uuid
-from collections.abc import Awaitable, Callable, Hashable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import psutil
@@ -427,7 +428,7 @@ def main() -> None:
     names, path = sys.argv[2:] or list(FAULTS), HERE / "faults.csv"
     about = {"command": " ".join(["python results/scale/faults.py", *sys.argv[1:]]), **origin(), "seed": SEED}
     kept = pd.read_csv(path, comment="#") if sys.argv[2:] and path.exists() else pd.DataFrame()
-    rows: dict[str, dict[Hashable, object]] = {str(row["fault"]): row for row in kept.to_dict("records")}
+    rows: dict[str, Any] = {str(row["fault"]): row for row in kept.to_dict("records")}
     for row in played(names, moments):
         rows[str(row["fault"])] = {**row, "commit": about["commit"]}
         print(row, flush=True)
