@@ -26,6 +26,8 @@ SPELLINGS = {
     "milliseconds": "ms", "radian": "rad", "radians": "rad", "volt": "V", "volts": "V", "pixel": "px", "pixels": "px",
 }  # fmt: skip
 STANDARD = re.compile(r"t|f|trajectory|(u|v|f|re|im)[1-9]\d{0,5}")
+# What is a reading and no name.
+NUMERIC = re.compile(r"[+-]?\d*[.,]?\d+([eE][+-]?\d+)?")
 # A name that was meant to be one of the standard ones, so that leaving it out would be wrong.
 NEARLY = re.compile(r"t|(u|v|f|re|im) ?_?\d*", re.IGNORECASE)
 # Names that are written out in a message.
@@ -255,6 +257,10 @@ def _told(header: Sequence[str]) -> str:
 
 def suggestion(header: Sequence[str], layout: Layout) -> str:
     """Return the options that would read a table, as a part of a sentence."""
+    cells = [cell for name in header for cell in name.split()]
+    if all(map(NUMERIC.fullmatch, cells)):
+        columns = ",".join(["t", *(f"u{k}" for k in range(1, min(len(cells), 4)))])
+        return f"; the file has no header: write a first row such as {columns} with a name for each column"
     time = layout.time or next(
         (name for name in header if re.match(r"(time|zeit|temps|t)(?![a-z])", name, re.IGNORECASE)), None
     )

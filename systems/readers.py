@@ -232,7 +232,12 @@ def from_frame(frame: pandas.DataFrame, source: str, ends: Ends = "unknown", lay
 
 
 def _from_table(table: Table, source: str, ends: Ends, layout: Layout) -> list[Samples]:
-    choice = choose(list(table.body.columns), layout, source, table.units)
+    try:
+        choice = choose(list(table.body.columns), layout, source, table.units)
+    except InputError as error:
+        # Of a workbook, that may be the wrong sheet.
+        told = [note for note in table.notes if note.startswith("sheet ")]
+        raise InputError("; ".join([str(error), *told])) from None
     if len(table.body) == 0:
         raise InputError(f"{source}: it has 0 row(s) of data; a motion needs at least 2")
     body, origin = table.body, replace(choice.origin, notes=(*table.notes, *choice.origin.notes))

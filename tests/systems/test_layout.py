@@ -280,3 +280,17 @@ def test_a_turn_that_is_none_is_refused(turn):
 def test_complex_readings_have_no_turn():
     with pytest.raises(InputError, match="file: --turn is for angles"):
         unwrapped(np.ones((3, 1)) * 1j, 360.0, "file")
+
+
+def test_a_file_without_a_header_and_a_workbook_of_several_sheets_are_told_as_such(tmp_path):
+    path = written(tmp_path, "0.000 28.954 -1.5e-3\n0.025 28.9 0.0\n0.050 28.7 0.1\n")
+    with pytest.raises(InputError, match=r"the file has no header: write a first row such as t,u1,u2 with a name for"):
+        read(path)
+    book = openpyxl.Workbook()
+    book.active.title = "about"
+    book.active.append(["who", "when"])
+    book.active.append(["me", "today"])
+    book.create_sheet("readings").append(["t", "u1"])
+    book.save(tmp_path / "book.xlsx")
+    with pytest.raises(InputError, match=r"there is no column t, .*; sheet 'about' is read, not 'readings'"):
+        read(tmp_path / "book.xlsx")
