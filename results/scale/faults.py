@@ -131,7 +131,11 @@ class Stage:
         """Start a program in a session of its own, with the mark."""
         environment = {**os.environ, MARK: self.mark, "OMP_NUM_THREADS": "1"}
         log = (self.folder / "log").open("ab")
-        process = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)
+        # A shell makes what it starts in the background deaf to Ctrl-C.
+        process = subprocess.Popen(
+            command, stdout=log, stderr=log, env=environment, start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )  # fmt: skip
         self.started.append(process)
         return process
 
@@ -389,7 +393,10 @@ def played(names: list[str], moments: int) -> Iterator[dict[str, object]]:
     for name in names:
         fault, began = FAULTS[name], time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
-            naps, eaters = MANY if fault in (worker_hangs, network_lost) else NAPS, moments * (fault is memory_exceeded)
+            naps, eaters = (
+                MANY if fault in (worker_hangs, network_lost, disk_full) else NAPS,
+                moments * (fault is memory_exceeded),
+            )
             stage = Stage(Path(folder).resolve(), moments, naps, eaters)
             fault(stage)
             final = stage.finished()
