@@ -80,10 +80,11 @@ def diagnose(
     _check_field(known, data)
     # Read together, since the two must be of the same chain.
     later = read_all([*files, *holdout], ends, layout)[len(data) :] if holdout else []
-    for line in dict.fromkeys(line for one in data for line in (*degrees(one, declared), *resting(one))):
-        print(printable(f"Warning: {line}."), file=sys.stderr)
     with watching() as watcher, redirect_stdout(sys.stderr):
         found, report = calls.diagnose(data, declared, order, effects=effects, later=later, watcher=watcher)
+    # What is refused is told in one line: only now is it known that this is not.
+    for line in dict.fromkeys(line for one in data for line in (*degrees(one, declared), *resting(one))):
+        print(printable(f"Warning: {line}."), file=sys.stderr)
     _report(found, report, json_out, html_out)
     if report.interrupted:
         raise typer.Abort
