@@ -13,7 +13,7 @@ import typer
 from latticebench.bench.cli.arguments import asked, kept
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, check_places, complete_systems, place
 from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, Turn, layout_of, read_told
-from latticebench.systems.errors import InputError, printable
+from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
     from latticebench.bench.report.content import Report
@@ -82,10 +82,8 @@ def diagnose(
     later = read_all([*files, *holdout], ends, layout)[len(data) :] if holdout else []
     with watching() as watcher, redirect_stdout(sys.stderr):
         found, report = calls.diagnose(data, declared, order, effects=effects, later=later, watcher=watcher)
-    # What is refused is told in one line: only now is it known that this is not.
-    for line in dict.fromkeys(line for one in data for line in (*degrees(one, declared), *resting(one))):
-        print(printable(f"Warning: {line}."), file=sys.stderr)
-    _report(found, report, json_out, html_out)
+    warnings = dict.fromkeys(line for one in data for line in (*degrees(one, declared), *resting(one)))
+    _report(found, report, json_out, html_out, tuple(warnings))
     if report.interrupted:
         raise typer.Abort
 
@@ -121,7 +119,9 @@ def _check_field(known: System | None, data: Sequence[Samples]) -> None:
         )
 
 
-def _report(found: Diagnosis, report: Report, json_out: str | None, html_out: Path | None) -> None:
+def _report(
+    found: Diagnosis, report: Report, json_out: str | None, html_out: Path | None, warnings: tuple[str, ...]
+) -> None:
     """Show a diagnosis on the screen, and write it as JSON and as a page.
 
     Raises:
@@ -130,6 +130,7 @@ def _report(found: Diagnosis, report: Report, json_out: str | None, html_out: Pa
     from latticebench.bench.overlay import of_diagnosis
     from latticebench.bench.report.content import diagnosis_document
     from latticebench.bench.report.document import provenance, to_json
+    from latticebench.bench.report.screen import show_warnings
     from latticebench.bench.report.text import show
     from latticebench.systems.files import write_text
 
@@ -149,6 +150,7 @@ def _report(found: Diagnosis, report: Report, json_out: str | None, html_out: Pa
     if json_out == "-":
         print(text, end="")
     else:
+        show_warnings(warnings)
         show(report)
     if failures:
         raise InputError("; ".join(failures))

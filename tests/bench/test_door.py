@@ -226,11 +226,10 @@ def test_a_diagnosis_points_at_degrees_in_a_sine_and_at_a_sensor_that_stopped(ty
     u += 0.05 * np.random.default_rng(2).normal(size=u.shape)
     u[200:, 1] = 12.5
     np.savetxt(tmp_path / "d.csv", np.column_stack([t, u]), "%.3f", ",", header="t,u1,u2", comments="")
-    words = ["--terms", "sin(u[n])", "--order", "2", "--ends", "free", "--json", "-"]
-    told, err = typed("diagnose", "d.csv", *words)
-    assert err.startswith(
-        "Warning: u reaches 20.1 in sin(...), which takes radians; if these are degrees: --scale deg."
-    )
-    notes = " ".join(json.loads(told)["notes"])
+    words = ["--terms", "sin(u[n])", "--order", "2", "--ends", "free", "--json", "d.json"]
+    shown, _ = typed("diagnose", "d.csv", *words)
+    assert shown.startswith("Warning: u reaches 20")
+    assert "Warning: u2: 12.5 from t = 10 to 19.95, while others move" in shown
+    notes = " ".join(json.loads((tmp_path / "d.json").read_text())["notes"])
     assert "in sin(...), which takes radians; if these are degrees: --scale deg." in notes
     assert "u2: 12.5 from t = 10 to 19.95, while others move" in notes
