@@ -412,7 +412,7 @@ def played(names: list[str], moments: int) -> Iterator[dict[str, object]]:
                 "lost": len(stage.seen - set(final)), "twice": len(final) - len(set(final)),
                 "never run": stage.cases - len(set(final)), "begun again": len(stage.diary) - stage.cases,
                 "left over": len(left), "exit codes": " ".join(f"{code}: {stage.codes.count(code)}" for code in
-                sorted(set(stage.codes))), "seconds": round(time.monotonic() - began),
+                sorted(set(stage.codes), reverse=True)), "seconds": round(time.monotonic() - began),
             }  # fmt: skip
 
 
