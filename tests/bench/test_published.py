@@ -202,3 +202,13 @@ def test_the_choice_is_the_least_geometric_mean_of_capped_ratios(script: Callabl
     # sqrt(1 * 10) is more than sqrt(4 * 2).
     assert list(chooses.means(table)["ratio"]) == pytest.approx([10**0.5, 8**0.5])
     assert chooses.chosen(table) == (2.0, 2.0)
+
+
+def test_of_the_faults_that_were_played_none_lost_anything_and_the_protocol_counts_the_mutants() -> None:
+    faults = pd.read_csv(RESULTS / "scale" / "faults.csv", comment="#")
+    assert len(faults) == 9
+    assert faults["struck"].eq(50).all()
+    assert faults[["lost", "twice", "never run", "left over"]].eq(0).all(axis=None)
+    assert "at fifty random moments" in words("cluster")
+    mutants = pd.read_csv(RESULTS / "mutants" / "mutants.csv", comment="#")
+    assert f"no test notices, of {len(mutants)} drawn" in words("protocol")
