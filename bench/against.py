@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from latticebench.bench.paired import FLOOR, LEVEL, SignedRank, holm, tested, verdict
+from latticebench.bench.paired import FLOOR, LEVEL, SignedRank, decided, tested
 from latticebench.bench.tables import ABOUT, FEW, counted, shown_truth
 from latticebench.systems.errors import InputError, unknown
 
@@ -101,7 +101,7 @@ def against(table: pd.DataFrame, reference: str) -> Contest:
     chosen = _named(reference, list(wide.columns))
     cases: list[tuple[Any, ...]] = []
     methods: list[tuple[Any, ...]] = []
-    leans: list[float] = []
+    tests: list[SignedRank] = []
     for name in wide.columns.drop(chosen):
         both = wide[[name, chosen]].dropna()
         if both.empty:
@@ -111,17 +111,11 @@ def against(table: pd.DataFrame, reference: str) -> Contest:
         counts = [sum(row[-1] == outcome for row in own) for outcome in ("win", "loss", "tie")]
         decades = np.log10(np.array([row[6] for row in own], dtype=float).clip(10.0**-ENDLESS, 10.0**ENDLESS))
         spread = [_ratio(value) for value in interval(decades)]
-        test = tested(both, "cases")
-        leans.append(test.lean)
-        methods.append((name, chosen, len(own), *counts, _ratio(float(np.median(decades))), *spread, test.p))
+        methods.append((name, chosen, len(own), *counts, _ratio(float(np.median(decades))), *spread))
+        tests.append(tested(both, "cases"))
     if not methods:
         raise InputError(f"--against {reference}: no other method has a case that it has")
-    found = pd.DataFrame(methods, columns=list(METHODS[:-1]))
-    found["p"] = holm(found["p"].tolist())
-    found["verdict"] = [
-        verdict(str(row["method"]), chosen, row["ratio"], SignedRank(row["p"], lean))
-        for lean, (_, row) in zip(leans, found.iterrows(), strict=True)
-    ]
+    found = decided(pd.DataFrame(methods, columns=list(METHODS[:-2])), tests)
     return Contest(found, pd.DataFrame(cases, columns=list(CASES)), _ranks(wide, chosen))
 
 

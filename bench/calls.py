@@ -40,10 +40,9 @@ def fit(data: Sequence[Samples], library: Library, order: int, method: Method, s
 def judged(data: Sequence[Samples], found: Fit) -> Adequacy:
     """Return how well a fitted equation describes the recordings it was fitted to, with hints where it does not."""
     from latticebench.bench.adequacy import adequacy
-    from latticebench.bench.report.notes import degrees, resting
+    from latticebench.bench.report.notes import doubts
 
-    hints = (line for one in data for line in (*degrees(one, found.library), *resting(one)))
-    return adequacy(data, found).also(tuple(dict.fromkeys(hints)))
+    return adequacy(data, found).also(doubts(data, found.library))
 
 
 def diagnose(

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from latticebench.bench.paired import FLOOR, UNDECIDED, SignedRank, holm, median_ratio, signed_rank, verdict
+from latticebench.bench.paired import FLOOR, UNDECIDED, decided, median_ratio, signed_rank
 from latticebench.bench.published import read_table
 from latticebench.bench.store import is_store, open_store
 from latticebench.systems.errors import InputError
@@ -97,7 +97,7 @@ def compare(old: pd.DataFrame, new: pd.DataFrame, factor: float = FACTOR, floor:
 
 def _by_method(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     """Judge each method by all pairs of its errors, of tables that have the same cases in the same order."""
-    rows, leans = [], []
+    rows, tests = [], []
     pairs = pd.DataFrame({"method": after["method"], "old": _counted(before), "new": _counted(after)})
     # Seeds between which nothing was drawn are one.
     pairs["kind"] = after["case"].str.rpartition(" | seed ")[0]
@@ -106,17 +106,12 @@ def _by_method(before: pd.DataFrame, after: pd.DataFrame) -> pd.DataFrame:
     pairs = pairs[known].dropna().drop_duplicates()
     for method, group in pairs.groupby("method", sort=False):
         old, new = group["old"].to_numpy(), group["new"].to_numpy()
-        test = signed_rank(new, old)
-        rows.append((method, len(group), median_ratio(new, old), test.p))
-        leans.append(test.lean)
-    found = pd.DataFrame(rows, columns=["method", "pairs", "ratio", "p"])
-    found["p"] = holm(found["p"].tolist())
-    told = [
-        verdict("new", "old", row["ratio"], SignedRank(row["p"], lean))
-        for lean, (_, row) in zip(leans, found.iterrows(), strict=True)
-    ]
+        rows.append((method, len(group), median_ratio(new, old)))
+        tests.append(signed_rank(new, old))
+    found = pd.DataFrame(rows, columns=["method", "pairs", "ratio"])
+    told = decided(found.assign(method="new", against="old"), tests)
     said = {"new better": "better", "old better": "worse", UNDECIDED: UNDECIDED}
-    return found.assign(verdict=[said[one] for one in told])
+    return found.assign(p=told["p"], verdict=told["verdict"].map(said))
 
 
 def _counted(frame: pd.DataFrame) -> pd.Series:

@@ -128,21 +128,22 @@ def paired(table: pd.DataFrame, over: Literal["cases", "seeds"] = "cases") -> pd
     wide = errors.pivot_table(
         index=[*ABOUT, "noise", "seed"], columns="method", values="e2", sort=False, aggfunc="first"
     )
-    rows, leans = [], []
+    rows, tests = [], []
     for a, b in itertools.combinations(wide.columns, 2):
         both = wide[[a, b]].dropna()
         if both.empty:
             continue
-        test = tested(both, over)
-        rows.append((a, b, both.groupby(level=ABOUT).ngroups, len(both), ratio_of(both, over), test.p))
-        leans.append(test.lean)
-    found = pd.DataFrame(rows, columns=list(COLUMNS[:-1]))
-    found["p"] = holm(found["p"].tolist())
-    found["verdict"] = [
-        verdict(str(row["method"]), str(row["against"]), row["ratio"], SignedRank(row["p"], lean))
-        for lean, (_, row) in zip(leans, found.iterrows(), strict=True)
-    ]
-    return found
+        rows.append((a, b, both.groupby(level=ABOUT).ngroups, len(both), ratio_of(both, over)))
+        tests.append(tested(both, over))
+    return decided(pd.DataFrame(rows, columns=list(COLUMNS[:-2])), tests)
+
+
+def decided(found: pd.DataFrame, tests: Sequence[SignedRank]) -> pd.DataFrame:
+    """Return a table of `method`, `against` and `ratio` with p after Holm's correction over all rows, and verdicts."""
+    p = holm([test.p for test in tests])
+    rows = zip(found["method"], found["against"], found["ratio"], p, tests, strict=True)
+    verdicts = [verdict(a, b, ratio, SignedRank(value, test.lean)) for a, b, ratio, value, test in rows]
+    return found.assign(p=p, verdict=verdicts)
 
 
 def tested(both: pd.DataFrame, over: Literal["cases", "seeds"]) -> SignedRank:

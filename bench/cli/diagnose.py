@@ -68,7 +68,7 @@ def diagnose(
 ) -> None:
     """Find what a declared equation lacks: trace its residual to an effect, add it, show the error before and after."""
     from latticebench.bench import calls
-    from latticebench.bench.report.notes import degrees, resting
+    from latticebench.bench.report.notes import doubts
     from latticebench.bench.report.screen import watching
     from latticebench.systems.readers import read_all
 
@@ -82,8 +82,7 @@ def diagnose(
     later = read_all([*files, *holdout], ends, layout)[len(data) :] if holdout else []
     with watching() as watcher, redirect_stdout(sys.stderr):
         found, report = calls.diagnose(data, declared, order, effects=effects, later=later, watcher=watcher)
-    warnings = dict.fromkeys(line for one in data for line in (*degrees(one, declared), *resting(one)))
-    _report(found, report, json_out, html_out, tuple(warnings))
+    _report(found, report, json_out, html_out, doubts(data, declared))
     if report.interrupted:
         raise typer.Abort
 

@@ -38,6 +38,8 @@ PERIODIC = ("sin", "cos", "tan")
 # A sensor has stopped where so many of its readings on end, and this share of all, are one number, while another moves
 # by this share of its range.
 STOPPED, LONG, MOVES = 20, 0.1, 0.2
+# Sensors that one line names.
+NAMED = 4
 
 
 def at_ends(values: Float[ndarray, " values"]) -> Iterator[tuple[float, int, str]]:
@@ -54,29 +56,33 @@ def at_ends(values: Float[ndarray, " values"]) -> Iterator[tuple[float, int, str
             yield float(level), int(count), end
 
 
+def doubts(data: Sequence[Samples], terms: Library) -> tuple[str, ...]:
+    """Return what makes readings hard to believe under an equation: `degrees` and `resting` of all recordings."""
+    return tuple(dict.fromkeys(line for one in data for line in (*degrees(one, terms), *resting(one))))
+
+
 def degrees(samples: Samples, terms: Library) -> list[str]:
     """Return where readings make no sense in the sines of an equation."""
-    largest = float(np.nanmax(np.abs(samples.u)))
-    if largest <= ANGLE or not any(terms.uses(name) for name in PERIODIC):
+    names = [name for name in PERIODIC if terms.uses(name)]
+    largest = float(np.nanmax(np.abs(samples.u))) if names else 0.0
+    if largest <= ANGLE:
         return []
-    name, unit = next(one for one in PERIODIC if terms.uses(one)), samples.origin.unit
+    unit = samples.origin.unit
     known = unit in ("deg", "arcmin")
     remedy = f"read the angles with --scale {unit}" if known else "if these are degrees: --scale deg"
-    return [f"u reaches {largest:.3g} in {name}(...), which takes radians; {remedy}"]
+    return [f"u reaches {largest:.3g} in {names[0]}(...), which takes radians; {remedy}"]
 
 
 def resting(samples: Samples) -> list[str]:
     """Return which sensors always read the same, or do so from some time on while others move."""
-    found = []
+    dead: dict[str, list[str]] = {}
+    stopped = []
     names = samples.origin.columns or [f"u{site + 1}" for site in range(samples.sites)]
-    for site, column in enumerate(samples.u.T):
-        rows = np.flatnonzero(np.isfinite(column))
-        values = column[rows]
-        if not len(rows):
-            continue
+    for site in _still(samples.u):
+        rows = np.flatnonzero(np.isfinite(samples.u[:, site]))
+        values = samples.u[rows, site]
         if np.all(values == values[0]):
-            level = values[0].real / samples.origin.scale
-            found.append(f"{names[site]}: always {level:g}; does this sensor work?")
+            dead.setdefault(f"{values[0].real / samples.origin.scale:g}", []).append(names[site])
             continue
         edges = np.flatnonzero(np.diff(values) != 0) + 1
         # What begins with the record may not have been set in motion yet.
@@ -84,12 +90,27 @@ def resting(samples: Samples) -> list[str]:
             if last - first < max(STOPPED, LONG * len(rows)):
                 continue
             some = slice(rows[first], rows[last - 1] + 1)
-            if any(_range(other[some]) > MOVES * _range(other) > 0 for other in np.delete(samples.u.T, site, axis=0)):
-                found.append(
+            if any(_range(samples.u[some, k]) > MOVES * _range(samples.u[:, k]) > 0 for k in range(samples.sites)):
+                stopped.append(
                     f"{names[site]}: {values[first].real / samples.origin.scale:g} from t = {samples.t[rows[first]]:g} "
                     f"to {samples.t[rows[last - 1]]:g}, while others move; if it had stopped, leave these cells empty"
                 )
-    return found
+    return [_dead(columns, level) for level, columns in dead.items()] + stopped
+
+
+def _still(u: ndarray) -> list[int]:
+    """Return the sites that were read and may have been at rest: half of STOPPED pairs of readings are the same."""
+    seen = np.isfinite(u)
+    alike = np.sum(u[1:] == u[:-1], axis=0)
+    few = np.sum(seen, axis=0) <= STOPPED
+    return np.flatnonzero(np.any(seen, axis=0) & ((alike >= STOPPED // 2) | few | ~np.all(seen, axis=0))).tolist()
+
+
+def _dead(columns: Sequence[str], level: str) -> str:
+    if len(columns) == 1:
+        return f"{columns[0]}: always {level}; does this sensor work?"
+    more = f" and {len(columns) - NAMED} more" if len(columns) > NAMED else ""
+    return f"{', '.join(columns[:NAMED])}{more}: always {level}; do these sensors work?"
 
 
 def _range(values: ndarray) -> float:
@@ -151,7 +172,7 @@ def notes(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
     for samples in _joined(diagnosis.data):
-        for line in (*degrees(samples, diagnosis.before.model.declared), *resting(samples)):
+        for line in doubts([samples], diagnosis.before.model.declared):
             yield f"{samples.source}: {line}."
         yield from strays(samples)
         yield from turns(samples)

@@ -158,24 +158,25 @@ def intervals(noticed: int, count: int) -> str:
     return f"{100 * noticed / count:.0f} % [{100 * found.low:.0f}, {100 * found.high:.0f}]"
 
 
+def _counted(name: str, group: pd.DataFrame) -> dict[str, Any]:
+    """Return what became of the mutants of a module."""
+    by = group["noticed by"].value_counts()
+    nearest, near = int(by.get("nearest", 0)), int(by.get("near", 0))
+    same = int((group["noticed by"].eq("survived") & group["why"].ne("")).sum())
+    return {
+        "module": name, "mutants": len(group), "noticed by the nearest tests": nearest, "by near ones": near,
+        "do the same": same, "noticed [95 %]": intervals(nearest + near, len(group)),
+        "of those that do something else [95 %]": intervals(nearest + near, len(group) - same),
+    }  # fmt: skip
+
+
 def page() -> str:
     """Return the text of mutants.md, made from mutants.csv beside this file."""
     table = _table()
     table["why"] = [EQUAL.get(text, "") for text in table["changed to"]]
     survived = table["noticed by"] == "survived"
     groups = [*table.groupby("module", sort=False), ("all", table)]
-    short = pd.DataFrame(
-        [
-            (name, len(group), int(group["noticed by"].eq("nearest").sum()), int(group["noticed by"].eq("near").sum()),
-             int((group["noticed by"].eq("survived") & group["why"].ne("")).sum()),
-             intervals(int(group["noticed by"].ne("survived").sum()), len(group)),
-             intervals(int(group["noticed by"].ne("survived").sum()),
-                       len(group) - int((group["noticed by"].eq("survived") & group["why"].ne("")).sum())))
-            for name, group in groups
-        ],
-        columns=["module", "mutants", "noticed by the nearest tests", "by near ones", "do the same",
-                 "noticed [95 %]", "of those that do something else [95 %]"],
-    )  # fmt: skip
+    short = pd.DataFrame([_counted(str(name), group) for name, group in groups])
     about = "".join(f"- {name}: {told}\n" for name, told in read_head(HERE / "mutants.csv").items())
     return (
         "# Mutants\n\nMade by `make mutants` (`results/mutants/mutants.py`, which says what is changed and which tests "

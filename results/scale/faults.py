@@ -16,6 +16,7 @@ import json
 import os
 import random
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -433,7 +434,7 @@ def main() -> None:
     """Break runs, and write the two files."""
     moments = int(sys.argv[1]) if len(sys.argv) > 1 else 50
     names, path = sys.argv[2:] or list(FAULTS), HERE / "faults.csv"
-    about = {"command": " ".join(["python results/scale/faults.py", *sys.argv[1:]]), **origin(), "seed": SEED}
+    about = {"command": shlex.join(["python", "results/scale/faults.py", *sys.argv[1:]]), **origin(), "seed": SEED}
     kept = pd.read_csv(path, comment="#") if sys.argv[2:] and path.exists() else pd.DataFrame()
     rows: dict[str, Any] = {str(row["fault"]): row for row in kept.to_dict("records")}
     for row in played(names, moments):

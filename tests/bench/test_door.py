@@ -217,6 +217,8 @@ def test_a_sensor_that_stops_is_pointed_at_and_one_that_still_waits_or_came_to_r
     dead[:, 2] = 12.5
     assert resting(Samples(t, u)) == resting(Samples(t, waits)) == resting(Samples(t, rests)) == []
     assert resting(Samples(t, dead)) == ["u3: always 12.5; does this sensor work?"]
+    many = np.column_stack([u, np.zeros((len(t), 6))])
+    assert resting(Samples(t, many)) == ["u4, u5, u6, u7 and 2 more: always 0; do these sensors work?"]
 
 
 @pytest.mark.slow
