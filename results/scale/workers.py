@@ -2,7 +2,7 @@
 
     python results/scale/workers.py [SHARE]
 
-runs a share of 20 000 quick fits (`stlsq`), 500 longer ones (`trajectory`) and 100 000 trivial cases (`oracle`, which
+runs a share of 20 000 quick fits (`stlsq`), 500 longer ones (`trajectory`) and 100 000 trivial cases (`zero`, which
 fits nothing), and writes workers.csv and workers.md.
 
 A case is phi^4 with 9 sites, lib2 and 1 % noise, each with a seed of its own. `alone` is one process that runs a tenth
@@ -33,7 +33,7 @@ from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent
 # Cases of a whole measurement.
-COUNTS = {"stlsq": 20_000, "trajectory": 500, "oracle": 100_000}
+COUNTS = {"stlsq": 20_000, "trajectory": 500, "zero": 100_000}
 EXECUTORS = {
     "local, 1 worker": ["--jobs", "1"],
     "local, 2 workers": ["--jobs", "2"],
@@ -93,7 +93,7 @@ def tasks_a_second() -> float:
 def kept_a_second() -> float:
     """Return how many results a client keeps, a hundred at once."""
     with tempfile.TemporaryDirectory() as name:
-        cases = load(str(suite(Path(name), "oracle", MESSAGES)))
+        cases = load(str(suite(Path(name), "zero", MESSAGES)))
         store, about = create(Path(name) / "store"), origin()
         keys = {identity: f"{number:064x}" for number, identity in enumerate(cases.by_identity)}
         store.plan(keys, {})
