@@ -40,6 +40,8 @@ EXECUTORS = {
     "dask, 1 worker": ["--executor", "dask", "--cluster", "local:1"],
     "dask, 2 workers": ["--executor", "dask", "--cluster", "local:2"],
 }
+# Seeds that a grid may have.
+MOST_SEEDS = 10_000
 # How many empty tasks and results the rates are measured with.
 MESSAGES = 2000
 
@@ -47,10 +49,12 @@ MESSAGES = 2000
 def suite(folder: Path, method: str, count: int) -> Path:
     """Write a suite of so many cases of a method on phi^4 with 9 sites, a seed each."""
     path = folder / f"{method}-{count}.toml"
-    path.write_text(
-        f'title = "many cases"\n\n[methods.{method}]\nmethod = "{method}"\n\n[[grid]]\nsystem = "phi4"\n'
-        f'libraries = ["lib2"]\nsites = [9]\nnoise = [0.01]\nseeds = "1-{count}"\n'
+    grids = (
+        f'[[grid]]\nsystem = "phi4"\nlibraries = ["lib2"]\nsites = [9]\nnoise = [0.01]\n'
+        f'seeds = "{first}-{min(first + MOST_SEEDS - 1, count)}"\n'
+        for first in range(1, count + 1, MOST_SEEDS)
     )
+    path.write_text("\n".join(['title = "many cases"\n', f'[methods.{method}]\nmethod = "{method}"\n', *grids]))
     return path
 
 
