@@ -122,6 +122,16 @@ def test_both_executors_make_the_same_rows_but_for_times_and_machines(cluster: C
 
 @posix
 @pytest.mark.slow
+def test_fits_at_a_worker_keep_freed_memory_as_those_here_do(cluster: Connection, tmp_path: Path) -> None:
+    path = written(tmp_path / "s", {"good": ""})
+    source = tmp_path / "s" / "hostile.py"
+    source.write_text(source.read_text().replace("0.5)", 'float("MALLOC_TRIM_THRESHOLD_" in os.environ))'))
+    results, tally = run(load(str(path)), create(tmp_path / "there"), executor=Dask(cluster))
+    assert tally.statuses == {"ok": 1}
+    assert [one["residual"] for one in results] == [0.0]
+
+
+@pytest.mark.slow
 def test_the_cases_of_a_worker_that_is_killed_are_run_by_the_next(cluster: Connection, tmp_path: Path) -> None:
     diary, gate = tmp_path / "diary", tmp_path / "gate"
     suite = suite_of(tmp_path / "s", {"held": f'diary = "{diary}", gate = "{gate}"'}, seeds="[1, 2, 3]")
