@@ -33,13 +33,14 @@ def check_cases(count: int, where: str) -> None:
         raise InputError(f"{where}: {_rounded(count)} cases, at most {MOST_CASES} are made unasked; {CONFIRM}")
 
 
-def check_size(case: Case, sites: int, where: str) -> None:
+def check_size(case: Case, sites: int, where: str, remedy: str = CONFIRM) -> None:
     """Refuse a case whose samples alone do not fit into its memory limit or the machine, or take very long to simulate.
 
     Args:
         case: what describes the samples.
         sites: their number.
         where: the place of the case, for the message.
+        remedy: what to do if it is meant so, for the message.
 
     Raises:
         InputError: it asks for more.
@@ -52,12 +53,12 @@ def check_size(case: Case, sites: int, where: str) -> None:
     if needed > limit:
         raise InputError(
             f"{where}: {_rounded(sites)} sites x {_rounded(samples)} samples x {_rounded(trajectories)} trajectories "
-            f"take {_rounded(needed // 2**20)} MiB at least, and {limit // 2**20} may be used; {CONFIRM}"
+            f"take {_rounded(needed // 2**20)} MiB at least, and {limit // 2**20} may be used; {remedy}"
         )
     if trajectories > MOST_TIME or getattr(case, "span", 0.0) * trajectories > MOST_TIME:
         raise InputError(
             f"{where}: a time of {case.span:g} in {_rounded(trajectories)} trajectories"  # type: ignore[attr-defined]
-            f" takes more than an hour to simulate (from {MOST_TIME:g} together); {CONFIRM}"
+            f" takes more than an hour to simulate (from {MOST_TIME:g} together); {remedy}"
         )
 
 

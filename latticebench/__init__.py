@@ -2,7 +2,7 @@
 
 For notebooks, each loaded when it is first used:
 
-- `read` a recording, look at it (`plot`, `animate`), `Model` an equation or take that of a `system`;
+- `read` or `simulate` a recording, look at it (`plot`, `animate`), `Model` an equation or take that of a `system`;
 - `fit` its coefficients, `diagnose` what it lacks, know the `limit` of what can be known;
 - `run` a suite of the benchmark, look at published `results`.
 
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from latticebench.fitted import Fitted, Residual, fit
     from latticebench.front import Bound, Cause, Run, Tables, diagnose, limit, results, run
     from latticebench.pictures import Film, Picture, Survey
-    from latticebench.recording import Inspected, Model, Recording, read, system
+    from latticebench.recording import Inspected, Model, Recording, read, simulate, system
 
 ROOMS = ("systems", "methods", "diagnosis", "bench")
 # In which module of this package a name lies.
 PLACES = {
     "Inspected": "recording", "Model": "recording", "Recording": "recording", "read": "recording",
-    "system": "recording",
+    "simulate": "recording", "system": "recording",
     "Fitted": "fitted", "Residual": "fitted", "fit": "fitted", "Film": "pictures", "Picture": "pictures",
     "Survey": "pictures",
     "Bound": "front", "Cause": "front", "Run": "front", "Tables": "front", "diagnose": "front", "limit": "front",
@@ -41,7 +41,7 @@ PLACES = {
 __all__ = [
     "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Survey",
     "Tables", "__version__", "bench", "diagnose", "diagnosis", "fit", "limit", "methods", "read", "results", "run",
-    "system", "systems",
+    "simulate", "system", "systems",
 ]  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args
@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 import pandas as pd
 
 from latticebench import systems
+from latticebench.bench.cli.arguments import case_of
+from latticebench.bench.effort import check_size
+from latticebench.bench.fitting import samples as make_samples
 from latticebench.bench.inspection import Inspection
 from latticebench.bench.inspection import inspect as inspect_samples
 from latticebench.bench.overlay import of_recording
@@ -333,3 +336,42 @@ def system(name: str, library: str = "equation") -> Model:
     """
     found = systems.find(name)
     return Model("; ".join(found.library(library).texts), found.order, found.ends)
+
+
+# What may be said of a simulation, besides its system.
+OBSERVED = (
+    "sites", "samples", "span", "uneven", "noise", "missing", "velocities", "trajectories", "ends", "initial", "seed"
+)  # fmt: skip
+
+WITHOUT_LIMITS = "latticebench.systems.simulate.simulate has no limits"
+
+
+def simulate(name: str, parameters: Mapping[str, float] | None = None, **observed: Any) -> Recording:
+    """Return a simulated recording of a system, as `latticebench simulate` writes it; all is dimensionless.
+
+    Args:
+        name: of the system, or a file with one.
+        parameters: of the system, by name; the others are its own.
+        **observed: how it is observed, each with what it is otherwise: `sites` and `ends` (the system's own), `initial`
+            (the state it starts from; the system's first), `samples` (50) and `span` (10): times are 0, span / samples,
+            ...; `uneven` (False) draws them at random; `noise` (0) is sigma over the RMS of the field about its mean,
+            `missing` (0) the share of lost values; `velocities` (True) are given where the system is of second order;
+            `trajectories` (1), each further one from another state; `seed` (1) of all that is drawn.
+
+    Raises:
+        InputError: there is no such system, parameter, state or argument, or a number is out of its range.
+
+    Examples:
+        >>> import latticebench as lb
+        >>> data = lb.simulate("phi4", {"C": 2.0, "v": 0.5}, sites=9, samples=60, noise=0.01)
+        >>> data
+        Recording(simulated samples: 9 sites, 60 rows)
+        >>> lb.fit(data, lb.system("phi4")).table["coefficient"].round(1).tolist()
+        [2.0, 2.0, -2.0]
+    """
+    for given in observed:
+        if given not in OBSERVED:
+            raise unknown("argument", given, OBSERVED, "simulate")
+    case = case_of(system=name, parameters=dict(parameters or {}), **observed)
+    check_size(case, case.sites or systems.find(name).sites, name, WITHOUT_LIMITS)
+    return Recording(tuple(one.observed() for one in make_samples(case, Path())))

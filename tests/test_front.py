@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 import latticebench as lb
+from commandline import succeed
 from latticebench import fitted, front, pictures, recording
 from latticebench.bench import calls
 from latticebench.systems.errors import InputError
@@ -33,7 +34,7 @@ def test_the_public_names_are_these_and_all_can_be_had():
         "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Survey",
         "Tables",
     ]  # fmt: skip
-    functions = ["diagnose", "fit", "limit", "read", "results", "run", "system"]
+    functions = ["diagnose", "fit", "limit", "read", "results", "run", "simulate", "system"]
     assert sorted(lb.__all__) == sorted([*classes, *functions, *lb.ROOMS, "__version__"])
     assert [getattr(lb, name).__doc__ for name in lb.__all__ if name != "__version__"].count(None) == 0
     defined = {
@@ -402,3 +403,26 @@ def test_what_is_no_recording_or_no_model_is_one_line(act):
         act("lab.csv", model)
     with pytest.raises(InputError, match=r"a model is made by .*; this is str"):
         act(data, "u[n]")
+
+
+def test_a_notebook_simulates_what_the_command_line_writes(tmp_path):
+    file = tmp_path / "phi4.csv"
+    succeed(
+        "simulate", "phi4", "--set", "C=1.5", "--sites", "7", "--samples", "20", "--noise", "0.01", "--missing", "0.1",
+        "--trajectories", "2", "--seed", "5", "--out", file, cwd=tmp_path,
+    )  # fmt: skip
+    made = lb.simulate(
+        "phi4", parameters={"C": 1.5}, sites=7, samples=20, noise=0.01, missing=0.1, trajectories=2, seed=5
+    )
+    pd.testing.assert_frame_equal(made.to_frame(), lb.read(file).to_frame())
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [({"name": "phi5"}, "phi4"), ({"parameters": {"D": 1.0}}, "D"), ({"noise": -1.0}, "noise"),
+     ({"span": 1e300}, "hour.*has no limits"), ({"samples": 1}, "samples"),
+     ({"nosie": 0.1}, "noise")],
+)  # fmt: skip
+def test_what_cannot_be_simulated_is_refused(given, told):
+    with pytest.raises(InputError, match=told):
+        lb.simulate(**{"name": "phi4", **given})
