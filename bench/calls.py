@@ -1,4 +1,4 @@
-"""What the command line and a notebook do alike with recordings and an equation.
+"""What the command line and a notebook do alike with recordings, simulated ones too, and an equation.
 
 The commands of `bench/cli` read options, and `latticebench.front` arguments; both then make these calls, so that they
 compute the same and refuse in the same words.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import threadpool_limits
 
@@ -22,9 +22,27 @@ from latticebench.systems.user_files import raised
 if TYPE_CHECKING:
     from latticebench.bench.adequacy import Adequacy
     from latticebench.bench.bounds import BoundOf
+    from latticebench.bench.fitting import FitCase
     from latticebench.bench.report.content import Report
     from latticebench.diagnosis.repair import Diagnosis
     from latticebench.diagnosis.search import Watcher
+
+
+def case_of(**given: Any) -> FitCase:
+    """Return the case that describes simulated samples; who fits them is left open.
+
+    Raises:
+        InputError: what is given describes no samples; the message has the option of the command line.
+    """
+    import pydantic
+
+    from latticebench.bench.fitting import FitCase
+
+    try:
+        return FitCase(**{"library": "", "label": "", "method": "", "memory_limit": 2**30, **given})
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"--{first['loc'][0]}: {first['msg'].lower()}, it is {first['input']!r}") from None
 
 
 def fit(data: Sequence[Samples], library: Library, order: int, method: Method, seed: int) -> Fit:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 import pandas as pd
 
 from latticebench import systems
-from latticebench.bench.cli.arguments import case_of
+from latticebench.bench.calls import case_of
 from latticebench.bench.effort import check_size
 from latticebench.bench.fitting import samples as make_samples
 from latticebench.bench.inspection import Inspection
@@ -338,12 +338,12 @@ def system(name: str, library: str = "equation") -> Model:
     return Model("; ".join(found.library(library).texts), found.order, found.ends)
 
 
-# What may be said of a simulation, besides its system.
+# What may be said of a simulation besides its system, and what has no bound on its size.
 OBSERVED = (
-    "sites", "samples", "span", "uneven", "noise", "missing", "velocities", "trajectories", "ends", "initial", "seed"
+    "sites", "samples", "span", "uneven", "noise", "missing", "velocities", "trajectories", "ends", "initial",
+    "integrator", "seed",
 )  # fmt: skip
-
-WITHOUT_LIMITS = "latticebench.systems.simulate.simulate has no limits"
+UNBOUNDED = "latticebench.systems.simulate.simulate has no limits"
 
 
 def simulate(name: str, parameters: Mapping[str, float] | None = None, **observed: Any) -> Recording:
@@ -356,7 +356,8 @@ def simulate(name: str, parameters: Mapping[str, float] | None = None, **observe
             (the state it starts from; the system's first), `samples` (50) and `span` (10): times are 0, span / samples,
             ...; `uneven` (False) draws them at random; `noise` (0) is sigma over the RMS of the field about its mean,
             `missing` (0) the share of lost values; `velocities` (True) are given where the system is of second order;
-            `trajectories` (1), each further one from another state; `seed` (1) of all that is drawn.
+            `trajectories` (1), each further one from another state; `integrator` (the system's own) is rk4, bdf or
+            dop853; `seed` (1) of all that is drawn.
 
     Raises:
         InputError: there is no such system, parameter, state or argument, or a number is out of its range.
@@ -373,5 +374,5 @@ def simulate(name: str, parameters: Mapping[str, float] | None = None, **observe
         if given not in OBSERVED:
             raise unknown("argument", given, OBSERVED, "simulate")
     case = case_of(system=name, parameters=dict(parameters or {}), **observed)
-    check_size(case, case.sites or systems.find(name).sites, name, WITHOUT_LIMITS)
+    check_size(case, case.sites or systems.find(name).sites, name, UNBOUNDED)
     return Recording(tuple(one.observed() for one in make_samples(case, Path())))

@@ -1,16 +1,15 @@
-"""What the texts on the command line stand for: equations, numbers, cases; and how outputs that fail are told."""
+"""What the texts on the command line stand for: equations and numbers; and how outputs that fail are told."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
-    from latticebench.bench.fitting import FitCase
     from latticebench.systems.lattice import Library, System
 
 
@@ -45,19 +44,6 @@ def asked(
             raise InputError("--order: 1 for du/dt, 2 for the second derivative")
         order = known.order
     return known, candidates, order
-
-
-def case_of(**given: Any) -> FitCase:
-    """Check what describes simulated samples."""
-    import pydantic
-
-    from latticebench.bench.fitting import FitCase
-
-    try:
-        return FitCase(**{"library": "", "label": "", "method": "", "memory_limit": 2**30, **given})
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(f"--{first['loc'][0]}: {first['msg'].lower()}, it is {first['input']!r}") from None
 
 
 def pairs(given: Sequence[str] | None) -> dict[str, str]:

@@ -6,11 +6,11 @@ import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from latticebench.bench.cli.arguments import asked, case_of, kept, numbers
+from latticebench.bench.cli.arguments import asked, kept, numbers
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, Yes, check_places, complete_systems
 from latticebench.bench.cli.options import Library as LibraryName
 from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, Turn, layout_of, read_told
@@ -18,7 +18,6 @@ from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
     from latticebench.bench.bounds import BoundOf
-    from latticebench.bench.fitting import FitCase
     from latticebench.bench.limit import Limit
     from latticebench.systems.lattice import Library
     from latticebench.systems.samples import Samples
@@ -93,12 +92,12 @@ def limit(
         )
     else:
         described.pop("set", None)
-        case = case_of(
+        bound = _of_simulated(
+            None if yes else sites or known.sites,
             system=system, parameters=numbers(given), library=candidates.name, known_ends=ends != "unknown",
             terms=candidates.texts if terms is not None else (), ends=None if ends == "unknown" else ends,
             **{"noise": 0.01, **described},
         )  # fmt: skip
-        bound = _of_simulated(case, None if yes else case.sites or known.sites)
     _report(bound, target, json_out)
 
 
@@ -111,14 +110,16 @@ def _of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> 
         return calls.bound(data, candidates, order)
 
 
-def _of_simulated(case: FitCase, sites: int | None) -> BoundOf:
-    """Return the bound of simulated samples; without `sites` they may be any size."""
+def _of_simulated(size: int | None, **described: Any) -> BoundOf:
+    """Return the bound of simulated samples of so many sites; without `size` they may be any number."""
     from latticebench.bench.bounds import BoundOf
+    from latticebench.bench.calls import case_of
     from latticebench.bench.effort import check_size
     from latticebench.bench.fitting import bound
 
-    if sites is not None:
-        check_size(case, sites, case.system)
+    case = case_of(**described)
+    if size is not None:
+        check_size(case, size, case.system)
 
     def bound_at(more: int, longer: int) -> Limit:
         changed = {"samples": case.samples * more * longer, "span": case.span * longer}

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from latticebench.bench.cli.arguments import case_of, numbers
+from latticebench.bench.cli.arguments import numbers
 from latticebench.bench.cli.options import KnownEnds, Settings, SystemName, Yes, check_places, place
 from latticebench.systems.errors import unknown
 from latticebench.systems.files import shown
@@ -48,6 +48,7 @@ def simulate(
 ) -> None:
     """Simulate a system and write samples of it."""
     from latticebench import systems
+    from latticebench.bench.calls import case_of
     from latticebench.bench.effort import check_size
     from latticebench.bench.fitting import samples as make_samples
     from latticebench.systems.folders import ZARR
