@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 
 export OMP_NUM_THREADS = 1
 
-.PHONY: bench test test-slow mutants speed lint types wheel docs clean
+.PHONY: bench test test-slow attacks mutants speed lint types wheel docs clean
 
 bench: $(READY)
 	$(BIN)/latticebench run default --results runs/default
@@ -17,6 +17,15 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow --benchmark-disable -n 2 --dist worksteal
+
+# Every attack of the tests with seeds that no run before had: make attacks FRESH=7.
+FRESH ?= $(shell date +%s)
+attacks: $(READY)
+	$(BIN)/python -m pytest tests/systems/test_damaged_files.py tests/systems/test_parser.py tests/systems/test_terms.py \
+		tests/systems/test_readers.py tests/bench/test_attacks.py tests/bench/test_commands.py tests/bench/test_escape.py \
+		tests/bench/test_full.py tests/bench/test_hostile.py tests/bench/test_killed.py tests/bench/test_odd_cells.py \
+		tests/bench/test_odd_recordings.py tests/bench/test_outputs.py tests/bench/test_streams.py \
+		--fresh $(FRESH) --hypothesis-seed $(FRESH) --benchmark-disable -n 2 --dist worksteal
 
 # Changes the code in one place at a time and sees whether the tests notice; some minutes a module.
 mutants: $(VENV)/.mutants

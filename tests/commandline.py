@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import FrameType
@@ -18,6 +18,8 @@ import pytest
 from latticebench.bench.cli import main
 from pace import pace
 
+# Gives the seeds of an attack from one number to before another; `--fresh` moves them.
+Seeds = Callable[[int, int], range]
 # Processor seconds of a 2.5 GHz core after which what is small, or refused, counts as a hang.
 SOON = 20.0
 # A suite of four small cases; an equation for any recording, and its fit.

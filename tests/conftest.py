@@ -1,4 +1,4 @@
-"""What all tests share: one thread, and the scripts in results/ as modules."""
+"""What all tests share: one thread, the seeds of attacks, and the scripts in results/ as modules."""
 
 import importlib.util
 import os
@@ -8,13 +8,36 @@ from pathlib import Path
 from types import ModuleType
 from unittest import mock
 
+import hypothesis
 import pytest
+
+from commandline import Seeds
 
 # Two threads on two busy cores are many times slower than one.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
+# Seeds of one number of `--fresh`.
+APART = 1_000_000
 RESULTS = Path(__file__).parents[1] / "results"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    told = "attack with seeds that are N times a million larger; --hypothesis-seed N draws texts anew, too"
+    parser.addoption("--fresh", type=int, default=0, metavar="N", help=told)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    hypothesis.settings.register_profile("repeated", derandomize=True)
+    hypothesis.settings.register_profile("fresh", database=None)
+    hypothesis.settings.load_profile("fresh" if config.getoption("--fresh") else "repeated")
+
+
+@pytest.fixture(scope="session")
+def seeds(pytestconfig: pytest.Config) -> Seeds:
+    """Return a function that gives the seeds of attacks."""
+    moved = APART * pytestconfig.getoption("--fresh")
+    return lambda first, end: range(moved + first, moved + end)
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from commandline import SUITE, latticebench, soon
+from commandline import SUITE, Seeds, latticebench, soon
 from latticebench.bench.store import FILE
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pipes and devices as POSIX has them")
@@ -79,11 +79,11 @@ def survive_commands(folder: Path, seeds: range) -> None:
 
 
 @posix
-def test_odd_command_lines_work_or_are_refused_in_one_line(tmp_path: Path) -> None:
-    survive_commands(tmp_path, range(25))
+def test_odd_command_lines_work_or_are_refused_in_one_line(tmp_path: Path, seeds: Seeds) -> None:
+    survive_commands(tmp_path, seeds(0, 25))
 
 
 @posix
 @pytest.mark.slow
-def test_many_odd_command_lines_work_or_are_refused_in_one_line(tmp_path: Path) -> None:
-    survive_commands(tmp_path, range(1000, 1300))
+def test_many_odd_command_lines_work_or_are_refused_in_one_line(tmp_path: Path, seeds: Seeds) -> None:
+    survive_commands(tmp_path, seeds(1000, 1300))

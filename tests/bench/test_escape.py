@@ -20,7 +20,7 @@ ODD = st.text(alphabet="=+-@'\"|<>[]()`$_\\,;#\t\r\n\x1b\x00ab1.e \ud800é", max
 
 
 @given(text=ODD)
-@settings(derandomize=True, max_examples=100, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_a_cell_of_a_csv_file_is_no_formula_and_comes_back(text: str) -> None:
     written = csv_table(pd.DataFrame({"a": [text], "b": [1.5]}))
     found = pd.read_csv(io.StringIO(written), dtype=str, keep_default_na=False)["a"][0]
@@ -31,7 +31,7 @@ def test_a_cell_of_a_csv_file_is_no_formula_and_comes_back(text: str) -> None:
 
 
 @given(text=ODD)
-@settings(derandomize=True, max_examples=100, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_a_cell_of_markdown_begins_no_element_is_no_link_and_ends_no_cell(text: str) -> None:
     found = markdown(text)
     assert "<a" not in found
@@ -41,7 +41,7 @@ def test_a_cell_of_markdown_begins_no_element_is_no_link_and_ends_no_cell(text: 
 
 
 @given(name=ODD, value=ODD)
-@settings(derandomize=True, max_examples=15, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_a_table_of_odd_texts_has_its_lines_and_no_others(name: str, value: str) -> None:
     frame = pd.DataFrame({"method": ["a", "b"], f"x{name}": [value, "1"]})
     for form, remark, lines in (("csv", "#", 3), ("md", "-", 5), ("tex", "%", 13)):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from commandline import Seeds
 from latticebench.bench.store import create, open_store
 
 # Puts cases of ever new seeds into a store and reports each, beginning with the seed given.
@@ -57,8 +58,8 @@ def written_until_killed(folder: Path, first: int, lines: int, pause: float) -> 
     return reported
 
 
-def hold_after_kills(folder: Path, kills: int) -> None:
-    draw = random.Random(1)
+def hold_after_kills(folder: Path, kills: int, seed: int) -> None:
+    draw = random.Random(seed)
     reported: list[int] = []
     for _ in range(kills):
         reported += written_until_killed(folder, len(reported), draw.randrange(40), draw.uniform(0, 0.02))
@@ -78,14 +79,18 @@ posix = pytest.mark.skipif(os.name != "posix", reason="sends SIGKILL")
 
 
 @posix
-def test_a_writing_run_that_is_killed_a_few_times_loses_nothing_and_has_nothing_twice(tmp_path: Path) -> None:
-    hold_after_kills(tmp_path / "store", 2)
+def test_a_writing_run_that_is_killed_a_few_times_loses_nothing_and_has_nothing_twice(
+    tmp_path: Path, seeds: Seeds
+) -> None:
+    hold_after_kills(tmp_path / "store", 2, *seeds(1, 2))
 
 
 @posix
 @pytest.mark.slow
-def test_a_writing_run_that_is_killed_fifty_times_loses_nothing_and_has_nothing_twice(tmp_path: Path) -> None:
-    hold_after_kills(tmp_path / "store", 50)
+def test_a_writing_run_that_is_killed_fifty_times_loses_nothing_and_has_nothing_twice(
+    tmp_path: Path, seeds: Seeds
+) -> None:
+    hold_after_kills(tmp_path / "store", 50, *seeds(1, 2))
 
 
 def test_two_stores_that_are_made_in_one_folder_at_once_are_one(tmp_path: Path) -> None:

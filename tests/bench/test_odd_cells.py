@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from commandline import soon, succeed
+from commandline import Seeds, soon, succeed
 
 ODD = ("1e49", "-1e49", "1e-300", "0", "-0", "", "nan", "+3", "1E1", ".5", "123456789012345678901234567890")
 FACTORS = (1e-300, 1e-150, 1e-60, 1e-6, -1.0, 1e6, 1e45)
@@ -93,19 +93,21 @@ def survive_diagnosis(folder: Path, seeds: range) -> None:
         taken_or_refused(seed, ("diagnose", "odd.csv", *MODELS[system], "--json", "out", "--html", "page"), folder)
 
 
-def test_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
-    survive_cells(tmp_path, range(5), ("least-squares", "stlsq"))
+def test_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Path, seeds: Seeds) -> None:
+    survive_cells(tmp_path, seeds(0, 5), ("least-squares", "stlsq"))
 
 
 @pytest.mark.slow
-def test_many_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
-    survive_cells(tmp_path, range(1000, 1150), ("least-squares", "stlsq", "weak", "sr3", "trajectory"))
+def test_many_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Path, seeds: Seeds) -> None:
+    survive_cells(tmp_path, seeds(1000, 1150), ("least-squares", "stlsq", "weak", "sr3", "trajectory"))
 
 
-def test_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path) -> None:
-    survive_diagnosis(tmp_path, range(3, 5))
+def test_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path, seeds: Seeds) -> None:
+    survive_diagnosis(tmp_path, seeds(3, 5))
 
 
 @pytest.mark.slow
-def test_many_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path) -> None:
-    survive_diagnosis(tmp_path, range(2000, 2030))
+def test_many_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon(
+    tmp_path: Path, seeds: Seeds
+) -> None:
+    survive_diagnosis(tmp_path, seeds(2000, 2030))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from commandline import soon
+from commandline import Seeds, soon
 from latticebench.systems.samples import Samples
 from latticebench.systems.writers import write
 
@@ -125,10 +125,10 @@ def survive(folder: Path, seeds: range) -> None:
         assert bool(out) == (code == 0), told
 
 
-def test_an_odd_recording_is_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path) -> None:
-    survive(tmp_path, range(12))
+def test_an_odd_recording_is_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path, seeds: Seeds) -> None:
+    survive(tmp_path, seeds(0, 12))
 
 
 @pytest.mark.slow
-def test_many_odd_recordings_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path) -> None:
-    survive(tmp_path, range(1000, 1300))
+def test_many_odd_recordings_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path, seeds: Seeds) -> None:
+    survive(tmp_path, seeds(1000, 1300))

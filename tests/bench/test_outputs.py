@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from commandline import SUITE, latticebench, refused, unchanged
+from commandline import SUITE, Seeds, latticebench, refused, unchanged
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.leases import Leases
 from latticebench.bench.published import read_table
@@ -197,13 +197,13 @@ def survive_tables(made: Path, folder: Path, seeds: range) -> None:
             assert "\x1b" not in out + err, (seed, command)
 
 
-def test_damaged_tables_are_read_or_refused_in_one_line(made: Path, tmp_path: Path) -> None:
-    survive_tables(made, tmp_path, range(4))
+def test_damaged_tables_are_read_or_refused_in_one_line(made: Path, tmp_path: Path, seeds: Seeds) -> None:
+    survive_tables(made, tmp_path, seeds(0, 4))
 
 
 @pytest.mark.slow
-def test_many_damaged_tables_are_read_or_refused_in_one_line(made: Path, tmp_path: Path) -> None:
-    survive_tables(made, tmp_path, range(100, 250))
+def test_many_damaged_tables_are_read_or_refused_in_one_line(made: Path, tmp_path: Path, seeds: Seeds) -> None:
+    survive_tables(made, tmp_path, seeds(100, 250))
 
 
 @pytest.mark.parametrize(

@@ -114,7 +114,7 @@ def test_binary_garbage_is_refused_in_every_format(tmp_path, suffix, seed):
 
 
 @given(content=st.binary(min_size=1, max_size=200))
-@settings(derandomize=True, max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_bytes_are_data_or_an_input_error(tmp_path, content):
     for suffix in FORMATS:
         path = tmp_path / f"any{suffix}"
@@ -124,7 +124,7 @@ def test_any_bytes_are_data_or_an_input_error(tmp_path, content):
 
 
 @given(text=st.text(alphabet='tuv12,.\n-#e "na', max_size=60).map("t,u1,u2\n0,1,2\n".__add__))
-@settings(derandomize=True, max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_table_is_data_or_an_input_error(tmp_path, text):
     path = tmp_path / "any.csv"
     path.write_text(text, encoding="utf-8")

@@ -140,7 +140,7 @@ TEXTS = st.one_of(st.text(max_size=60), st.lists(PIECES, max_size=25).map("".joi
 
 
 @given(TEXTS)
-@settings(derandomize=True, max_examples=200, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_any_text_is_a_term_or_a_term_error_and_takes_no_minutes(text):
     # Processor time, which a busy machine does not stretch.
     begin = time.process_time()
@@ -160,7 +160,7 @@ def test_any_text_is_a_term_or_a_term_error_and_takes_no_minutes(text):
 
 
 @given(st.text(alphabet="()-+~*unt[]1 .", min_size=50, max_size=MAX_LENGTH))
-@settings(derandomize=True, max_examples=50, deadline=None, suppress_health_check=[HealthCheck.large_base_example])
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.large_base_example])
 def test_long_nested_texts_never_exhaust_the_stack(text):
     with contextlib.suppress(TermError):
         Term(text)

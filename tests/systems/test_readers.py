@@ -59,7 +59,7 @@ def assert_same(got, wanted):
 
 @pytest.mark.parametrize("suffix", FORMATS)
 @given(data=data_sets())
-@settings(derandomize=True, max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_what_is_written_is_read_again_to_the_last_digit(tmp_path, suffix, data):
     path = tmp_path / f"data{suffix}"
     write(data, path)

@@ -121,7 +121,7 @@ def test_split_reads_terms_in_their_order_and_keeps_their_texts():
 
 
 @given(value=st.floats(-5, 5).filter(lambda value: abs(value) > 1e-3))
-@settings(derandomize=True, max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_a_parameter_keeps_its_sign_under_every_operator(plainly, value):
     for text in (
         "C**2*u[n]",
@@ -217,7 +217,7 @@ def test_a_number_that_no_computer_holds_is_told(text):
 
 
 @given(st.lists(st.floats(-9, 9).map(lambda value: round(value, 6)), min_size=5, max_size=5))
-@settings(derandomize=True, max_examples=25, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_express_gives_back_what_a_combination_was_made_of(numbers):
     terms = split("u[n+1]; u[n]; u[n]**3; sin(2*u[n]); u[n]*v[n]")
     text = " + ".join(f"({number!r})*({term})" for number, term in zip(numbers, terms, strict=True))
