@@ -130,6 +130,7 @@ def read(
     scale: str | float = 1.0,
     sort: bool = False,
     turn: float = 0.0,
+    time_scale: str | float = 1.0,
 ) -> Recording:
     """Read a recording.
 
@@ -143,6 +144,8 @@ def read(
         sort: sort rows by their times, and average rows of the same time.
         turn: unwrap angles that jump back after a full turn. It is a full turn in the unit of the file, such as 360;
             neighbouring readings must be less than half of it apart. 0 leaves u as it is. v is never changed.
+        time_scale: what one unit of the times is in the equation: a number, or the unit of the times such as "ms",
+            which become seconds. v, the change of u in one unit of the times, is divided by it.
 
     Raises:
         InputError: it cannot be read; the message says where, and what would read it.
@@ -164,7 +167,7 @@ def read(
         Recording(arrays: 1 site, 3 rows)
     """
     chosen = (columns,) if isinstance(columns, str) else tuple(columns)
-    layout = Layout(time, chosen, str(scale), sort, turn)
+    layout = Layout(time, chosen, str(scale), sort, turn, str(time_scale))
     if is_labelled(source):
         table, layout = as_table(source, layout)
         return Recording(tuple(from_frame(table, type(source).__name__, "unknown", layout)))

@@ -17,7 +17,8 @@ UNITS: dict[str, tuple[float, str]] = {
     "urad": (1e-6, "rad"), "m": (1.0, "m"), "cm": (1e-2, "m"), "mm": (1e-3, "m"), "um": (1e-6, "m"), "nm": (1e-9, "m"),
     "V": (1.0, "V"), "mV": (1e-3, "V"), "uV": (1e-6, "V"), "A": (1.0, "A"), "mA": (1e-3, "A"),
 }  # fmt: skip
-TIMES = ("s", "ms", "us", "ns", "min", "h")
+# What one of a unit is in seconds.
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 OTHER = ("N", "K", "Hz", "g", "kg", "px", "C", "Pa", "W", "1")
 # How else people write them.
 SPELLINGS = {
@@ -47,6 +48,8 @@ class Layout:
         sort: put rows in the order of their times, and average rows of the same time.
         turn: unwrap angles that jump back after a full turn. It is a full turn in the unit of the file, such as 360;
             neighbouring readings must be less than half of it apart. 0 leaves u as it is. v is never changed.
+        time_scale: what one unit of the times is in the equation: a number, or the unit of the times, such as "ms",
+            which become seconds. v, the change of u in one unit of the times, is divided by it.
     """
 
     time: str | None = None
@@ -54,6 +57,7 @@ class Layout:
     scale: str = "1"
     sort: bool = False
     turn: float = 0.0
+    time_scale: str = "1"
 
     @property
     def period(self) -> float:
@@ -78,12 +82,25 @@ class Layout:
         unit = spelt(self.scale)
         if unit in UNITS:
             return UNITS[unit][0]
-        try:
-            value = float(self.scale)
-        except ValueError:
-            value = math.nan
+        value = _number(self.scale)
         if not math.isfinite(value) or value == 0:
             raise InputError(f"{unknown('scale', self.scale, UNITS, '--scale')}; or a number such as 1e-3")
+        return value
+
+    @property
+    def time_factor(self) -> float:
+        """What one unit of the times is in the equation.
+
+        Raises:
+            InputError: the scale is neither a positive number nor a known unit.
+        """
+        unit = spelt(self.time_scale)
+        if unit in TIMES:
+            return TIMES[unit]
+        value = _number(self.time_scale)
+        if not (math.isfinite(value) and value > 0):
+            told = unknown("scale", self.time_scale, TIMES, "--time-scale")
+            raise InputError(f"{told}; or a number above 0 such as 1e-3")
         return value
 
     @property
@@ -91,6 +108,20 @@ class Layout:
         """The unit of the readings that the scale names; "" where it is a number."""
         unit = spelt(self.scale)
         return unit if unit in UNITS else ""
+
+    @property
+    def time_unit(self) -> str:
+        """The unit of the times that their scale names; "" where it is a number."""
+        unit = spelt(self.time_scale)
+        return unit if unit in TIMES else ""
+
+
+def _number(text: str) -> float:
+    """Return a number; NaN where a text is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 @dataclass(frozen=True)
@@ -165,7 +196,7 @@ def choose(header: Sequence[str], layout: Layout, source: str, units: Mapping[st
         )
     told = {name: spelt((units or {}).get(name, "").strip("[]() ")) or unit_of(name) for name in names}
     origin = _origin(layout, time, list(chosen), told, source)
-    return Choice(standard, origin.noting(*_notes(layout, origin, left)))
+    return Choice(standard, origin.noting(*_notes(layout, origin, told[time], left)))
 
 
 def _columns(header: Sequence[str], layout: Layout, source: str) -> dict[str, str]:
@@ -216,21 +247,32 @@ def _origin(layout: Layout, time: str, columns: Sequence[str], told: Mapping[str
         raise InputError(f"{source}: --scale {layout.scale}: the columns say that they are in {unit}")
     unit, factor = unit or layout.unit, layout.factor
     becomes = unit if factor == 1 else UNITS[layout.unit][1] if layout.unit else ""
-    return Origin(time=told[time], unit=unit, scale=factor, becomes=becomes, columns=tuple(columns))
+    if layout.time_unit and told[time] and told[time] != layout.time_unit:
+        raise InputError(f"{source}: --time-scale {layout.time_scale}: column {time} says that it is in {told[time]}")
+    return Origin(
+        time="s" if layout.time_unit else told[time] if layout.time_factor == 1 else "",
+        unit=unit,
+        scale=factor,
+        becomes=becomes,
+        columns=tuple(columns),
+    )
 
 
-def _notes(layout: Layout, origin: Origin, left: Sequence[str]) -> list[str]:
-    """Return what to know about the columns: what they are read as, and which are not read."""
+def _notes(layout: Layout, origin: Origin, time: str, left: Sequence[str]) -> list[str]:
+    """Return what to know about the columns: what they are read as, the times in which unit, and which are not read."""
     notes = []
+    times = f"times from {layout.time or 't'}{f' in {time or layout.time_unit}' if time or layout.time_unit else ''}"
+    if layout.time_factor != 1:
+        times += (
+            f", {origin.time} in the equation" if origin.time else f", times {layout.time_factor:g} in the equation"
+        )
     if origin.columns:
         unit = f" in {origin.unit}" if origin.unit else ""
         into = f", {origin.becomes} in the equation" if origin.becomes not in ("", origin.unit) else ""
         into = into or (f", times {origin.scale:g} in the equation" if origin.scale != 1 else "")
-        time = f" in {origin.time}" if origin.time else ""
-        listed = listing(origin.columns)
-        notes.append(
-            f"times from {layout.time or 't'}{time}; sites 1 to {len(origin.columns)} from {listed}{unit}{into}"
-        )
+        notes.append(f"{times}; sites 1 to {len(origin.columns)} from {listing(origin.columns)}{unit}{into}")
+    elif layout.time_factor != 1:
+        notes.append(times)
     if origin.unit in ("deg", "arcmin") and origin.scale == 1:
         notes.append(f"angles are taken in {origin.unit}, as they are; --scale {origin.unit} makes them radians")
     if left:

@@ -136,8 +136,7 @@ class _Told:
     ends: Ends
     origin: Origin
     time: str = "t"
-    sort: bool = False
-    turn: float = 0.0
+    layout: Layout = PLAIN
 
 
 def _trajectories(arrays: Arrays, labels: ndarray | None, told: _Told) -> list[Samples]:
@@ -159,15 +158,16 @@ def _trajectories(arrays: Arrays, labels: ndarray | None, told: _Told) -> list[S
 
 def _samples(arrays: Arrays, told: _Told) -> Samples:
     """Return one trajectory, in the units of the equation."""
-    arrays, notes = in_order(arrays, told.source, told.time, sort=told.sort)
+    arrays, notes = in_order(arrays, told.source, told.time, sort=told.layout.sort)
     origin = told.origin.noting(*notes)
-    if told.turn:
+    turn, pace = told.layout.period, told.layout.time_factor
+    if turn:
         assert arrays["u"] is not None
         # Before rows of the same time are averaged: halfway from 359 to 1 is 360, not 180.
-        arrays = {**arrays, "u": unwrapped(arrays["u"], told.turn, told.source)}
+        arrays = {**arrays, "u": unwrapped(arrays["u"], turn, told.source)}
         unit = f" {origin.unit}" if origin.unit else ""
-        origin = origin.noting(f"angles are unwrapped (a full turn is {told.turn:g}{unit})")
-    if told.sort:
+        origin = origin.noting(f"angles are unwrapped (a full turn is {turn:g}{unit})")
+    if told.layout.sort:
         arrays, notes = averaged(arrays)
         origin = origin.noting(*notes)
     t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
@@ -175,6 +175,8 @@ def _samples(arrays: Arrays, told: _Told) -> Samples:
     assert u is not None
     if origin.scale != 1:
         u, v = u * origin.scale, None if v is None else v * origin.scale
+    if pace != 1:
+        t, v = t * pace, None if v is None else v / pace
     return Samples(t, u, v, f, None, told.source, told.ends, origin)
 
 
@@ -242,6 +244,8 @@ def _from_table(table: Table, source: str, ends: Ends, layout: Layout) -> list[S
         raise InputError(f"{source}: it has 0 row(s) of data; a motion needs at least 2")
     body, origin = table.body, replace(choice.origin, notes=(*table.notes, *choice.origin.notes))
     body, said = _with_seconds(body, choice.names["t"], source)
+    if said and layout.time_factor != 1:
+        raise InputError(f"{source}: --time-scale {layout.time_scale}: dates become seconds already; leave it out")
     if said:
         origin = replace(origin.noting(said), time="s")
     numbers = {new: _numbers(body, old, source) for new, old in choice.names.items() if new != "trajectory"}
@@ -261,7 +265,7 @@ def _from_table(table: Table, source: str, ends: Ends, layout: Layout) -> list[S
         f = np.repeat(numbers["f"][:, None], u.shape[1], axis=1)
     labels = body[choice.names["trajectory"]].astype(str).to_numpy() if "trajectory" in choice.names else None
     arrays = {"t": numbers["t"], "u": u, "v": v, "f": f}
-    return _trajectories(arrays, labels, _Told(source, ends, origin, choice.names["t"], layout.sort, layout.period))
+    return _trajectories(arrays, labels, _Told(source, ends, origin, choice.names["t"], layout))
 
 
 def _with_seconds(body: pandas.DataFrame, time: str, source: str) -> tuple[pandas.DataFrame, str]:
@@ -440,8 +444,8 @@ def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends, layout: La
     if labels is not None and labels.shape != t.shape:
         raise InputError(f"{source}: array trajectory has shape {labels.shape}; it must be {t.shape}")
     becomes = UNITS[layout.unit][1] if layout.unit else ""
-    origin = Origin(unit=layout.unit, scale=layout.factor, becomes=becomes)
-    told = _Told(source, ends, origin, sort=layout.sort, turn=layout.period)
+    origin = Origin(time="s" if layout.time_unit else "", unit=layout.unit, scale=layout.factor, becomes=becomes)
+    told = _Told(source, ends, origin, layout=layout)
     return _trajectories({"t": t.astype(float), "u": u, "v": v, "f": f}, labels, told)
 
 

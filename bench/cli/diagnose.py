@@ -12,7 +12,7 @@ import typer
 
 from latticebench.bench.cli.arguments import asked, kept
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, check_places, complete_systems, place
-from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, Turn, layout_of, read_told
+from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ def diagnose(
     time: Time = None,
     columns: Columns = None,
     scale: Scale = "1",
+    time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
     json_out: JsonOut = None,
@@ -73,7 +74,7 @@ def diagnose(
     from latticebench.systems.readers import read_all
 
     check_places([*files, *(holdout or ()), effects, system], json=json_out, html=html_out)
-    layout = layout_of(time, columns, scale, sort, turn)
+    layout = layout_of(time, columns, scale, sort, turn, time_scale)
     known, declared, order = _declared(system, terms, order)
     ends = ends or ("unknown" if known is None else known.ends)
     data = read_told(files, ends, layout)

@@ -24,7 +24,7 @@ from latticebench.bench.cli.options import (
     check_places,
     place,
 )
-from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, Turn, layout_of, read_told
+from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ def fit(
     time: Time = None,
     columns: Columns = None,
     scale: Scale = "1",
+    time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
     json_out: JsonOut = None,
@@ -79,7 +80,7 @@ def fit(
 
     method = methods.DEFAULT if method is None else method
     check_places([*files, system, method], json=json_out, html=html_out)
-    layout = layout_of(time, columns, scale, sort, turn)
+    layout = layout_of(time, columns, scale, sort, turn, time_scale)
     own = code_file(method)
     chosen = None if own is not None else make(methods.find(method), pairs(given), texts=True)
     if own is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from latticebench.bench.cli.options import JsonOut, SystemOption, Terms, check_places, place
-from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, Turn, layout_of
+from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, TimeScale, Turn, layout_of
 
 if TYPE_CHECKING:
     from latticebench.bench.inspection import Inspection
@@ -29,6 +29,7 @@ def inspect(
     time: Time = None,
     columns: Columns = None,
     scale: Scale = "1",
+    time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
     json_out: JsonOut = None,
@@ -54,7 +55,7 @@ def inspect(
     if out is not None and out.suffix.lower() not in PICTURES:
         raise unknown("ending", out.suffix, PICTURES, f"--out {out}")
     declared = _terms(system, terms)
-    data = read_all(files, "unknown", layout_of(time, columns, scale, sort, turn))
+    data = read_all(files, "unknown", layout_of(time, columns, scale, sort, turn, time_scale))
     found = [look(one, declared) for one in data]
     failures: list[str] = []
     if json_out is not None:

@@ -13,7 +13,7 @@ import typer
 from latticebench.bench.cli.arguments import asked, kept, numbers
 from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, Yes, check_places, complete_systems
 from latticebench.bench.cli.options import Library as LibraryName
-from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, Turn, layout_of, read_told
+from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ def limit(
     time: Time = None,
     columns: Columns = None,
     scale: Scale = "1",
+    time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
     json_out: JsonOut = None,
@@ -72,6 +73,8 @@ def limit(
     Options from --set to --initial are about samples of a system; of recorded ones everything is known but their
     noise, which is what a fit leaves at each sensor.
     """
+    from latticebench.systems.layout import Layout
+
     check_places([*(files or ()), system], json=json_out)
     known, candidates, order = asked(system, library, terms, order)
     simulated = {
@@ -79,16 +82,17 @@ def limit(
         "trajectories": trajectories, "velocities": velocities, "initial": initial,
     }  # fmt: skip
     described = {name: value for name, value in simulated.items() if value is not None}
-    layout = layout_of(time, columns, scale, sort, turn)
+    layout = layout_of(time, columns, scale, sort, turn, time_scale)
     if files:
         for name in described:
             raise InputError(f"--{name}: files are given, whose samples are as they are; leave it out, or the files")
         bound = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
-    elif layout != layout_of(None, None, "1", False, 0.0):
+    elif layout != Layout():
         raise InputError(
-            "--time, --columns, --scale, --sort and --turn say how files are read: give files, or leave them out"
+            "--time, --columns, --scale, --time-scale, --sort and --turn say how files are read: "
+            "give files, or leave them out"
         )
     else:
         described.pop("set", None)

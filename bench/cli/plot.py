@@ -9,7 +9,7 @@ import typer
 
 from latticebench.bench.cli.arguments import kept
 from latticebench.bench.cli.options import check_places, place
-from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, Turn, layout_of, read_told
+from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import shown
 
@@ -39,6 +39,7 @@ def plot(
     time: Time = None,
     columns: Columns = None,
     scale: Scale = "1",
+    time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
 ) -> None:
@@ -60,7 +61,7 @@ def plot(
     if animate is not None:
         check_film(animate)
     check_places([file], out=out, animate=animate)
-    overlay = _overlay(file, trajectory, layout_of(time, columns, scale, sort, turn))
+    overlay = _overlay(file, trajectory, layout_of(time, columns, scale, sort, turn, time_scale))
     for name in only or ():
         if name not in panels(overlay):
             raise unknown("panel", name, panels(overlay), "--only")

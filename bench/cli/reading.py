@@ -58,18 +58,28 @@ Turn = Annotated[
         "360; neighbouring readings must be less than half of it apart. v is not changed.",
     ),
 ]  # fmt: skip
+TimeScale = Annotated[
+    str,
+    typer.Option(
+        "--time-scale", metavar="NUMBER|UNIT", rich_help_panel=PANEL,
+        help="What one unit of the times is in the equation: a number, or the unit, such as ms, which becomes s. "
+        "v is divided by it.",
+    ),
+]  # fmt: skip
 
 
-def layout_of(time: str | None, columns: Sequence[str] | None, scale: str, sort: bool, turn: float) -> Layout:
+def layout_of(
+    time: str | None, columns: Sequence[str] | None, scale: str, sort: bool, turn: float, time_scale: str
+) -> Layout:
     """Return the layout that the options describe.
 
     Raises:
-        InputError: the scale is neither a number nor a unit, or the turn is none.
+        InputError: a scale is neither a number nor a unit, or the turn is none.
     """
     from latticebench.systems.layout import Layout
 
-    layout = Layout(time, tuple(columns or ()), scale, sort, turn)
-    _ = layout.factor, layout.period
+    layout = Layout(time, tuple(columns or ()), scale, sort, turn, time_scale)
+    _ = layout.factor, layout.period, layout.time_factor
     return layout
 
 

@@ -92,6 +92,37 @@ def test_velocities_and_inputs_keep_their_standard_names_beside_chosen_columns(t
     assert "not read: u1" in one.origin.notes
 
 
+@pytest.mark.parametrize(
+    ("head", "scale", "unit", "told"),
+    [
+        ("t_ms", "ms", "s", "times from t_ms in ms, s in the equation"),
+        ("t_ms", "0.001", "", "times from t_ms in ms, times 0.001 in the equation"),
+        ("when", "milliseconds", "s", "times from when in ms, s in the equation"),
+    ],
+)
+def test_times_become_seconds_and_velocities_are_per_second_then(tmp_path, head, scale, unit, told):
+    path = written(tmp_path, f"{head},x1,v1,f\n0,1,2,3\n500,2,2,3\n")
+    (one,) = read(path, layout=Layout(head, ("x*",), "0.5", time_scale=scale))
+    np.testing.assert_allclose(one.t, [0, 0.5])
+    np.testing.assert_allclose(one.v[:, 0], [1000, 1000])
+    assert (one.origin.time, one.u[1, 0], one.f[0, 0]) == (unit, 1.0, 3.0)
+    assert one.origin.notes[0].startswith(told)
+
+
+def test_the_times_of_arrays_and_of_standard_columns_are_scaled_too(tmp_path):
+    np.savez(tmp_path / "a.npz", t=np.arange(3), u=np.ones((3, 1)))
+    (one,) = read(tmp_path / "a.npz", layout=Layout(time_scale="min"))
+    np.testing.assert_allclose(one.t, [0, 60, 120])
+    assert one.origin.time == "s"
+    (one,) = read(written(tmp_path, "t,u1\n0,1\n1,2\n"), layout=Layout(time_scale="h"))
+    assert (one.t[1], one.origin.notes) == (3600, ("times from t in h, s in the equation",))
+
+
+def test_dates_are_not_scaled_once_more(tmp_path):
+    with pytest.raises(InputError, match="--time-scale ms: dates become seconds already"):
+        read(written(tmp_path, "t;u1\n10:00;1\n10:01;2\n"), layout=Layout(time_scale="ms"))
+
+
 def test_a_spreadsheet_is_read_as_the_table_that_it_holds(tmp_path):
     book = openpyxl.Workbook()
     book.active.append(["Torsion chain"])
@@ -183,6 +214,9 @@ def test_additional_columns_are_left_out_and_named(tmp_path):
         (Layout("time_s", ("theta_*_deg",), "mm"), ["--scale mm", "in deg"]),
         (Layout("time_s", ("theta_*_deg",), "furlong"), ["--scale", "'furlong'"]),
         (Layout("time_s", ("theta_*_deg",), "0"), ["--scale", "'0'"]),
+        (Layout("time_s", ("theta_*_deg",), time_scale="ms"), ["--time-scale ms", "column time_s", "in s"]),
+        (Layout("time_s", ("theta_*_deg",), time_scale="fortnight"), ["--time-scale", "'fortnight'"]),
+        (Layout("time_s", ("theta_*_deg",), time_scale="-1"), ["--time-scale", "'-1'", "above 0"]),
         (Layout("time_s"), ["u1..uN", '--columns "theta_*_deg"']),
     ],
     ids=str,
