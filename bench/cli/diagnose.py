@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from latticebench.bench.cli.arguments import asked, kept
-from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, check_places, complete_systems, place
+from latticebench.bench.cli.options import AnyEnds, HtmlOut, JsonOut, Order, check_places, complete_systems
 from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
 from latticebench.systems.errors import InputError
 
@@ -63,9 +63,7 @@ def diagnose(
     sort: Sort = False,
     turn: Turn = 0.0,
     json_out: JsonOut = None,
-    html_out: Annotated[
-        Path | None, typer.Option("--html", metavar="OUT", parser=place, help="Write one HTML file with pictures.")
-    ] = None,
+    html_out: HtmlOut = None,
 ) -> None:
     """Find what a declared equation lacks: trace its residual to an effect, add it, show the error before and after."""
     from latticebench.bench import calls

@@ -12,6 +12,7 @@ import typer
 from latticebench.bench.cli.arguments import asked, kept, pairs
 from latticebench.bench.cli.options import (
     AnyEnds,
+    HtmlOut,
     JsonOut,
     Library,
     MemoryLimit,
@@ -22,7 +23,6 @@ from latticebench.bench.cli.options import (
     Terms,
     TimeLimit,
     check_places,
-    place,
 )
 from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
 from latticebench.systems.errors import InputError
@@ -62,9 +62,7 @@ def fit(
     sort: Sort = False,
     turn: Turn = 0.0,
     json_out: JsonOut = None,
-    html_out: Annotated[
-        Path | None, typer.Option("--html", metavar="OUT", parser=place, help="Write one HTML file with pictures.")
-    ] = None,
+    html_out: HtmlOut = None,
 ) -> None:
     """Fit the coefficients of a library to recorded samples.
 

@@ -73,8 +73,6 @@ def limit(
     Options from --set to --initial are about samples of a system; of recorded ones everything is known but their
     noise, which is what a fit leaves at each sensor.
     """
-    from latticebench.systems.layout import Layout
-
     check_places([*(files or ()), system], json=json_out)
     known, candidates, order = asked(system, library, terms, order)
     simulated = {
@@ -89,11 +87,8 @@ def limit(
         bound = _of_recordings(read_told(files, ends or "unknown", layout), candidates, order)
     elif known is None or system is None:
         raise InputError("give one or more files, or --system: the bound is about samples")
-    elif layout != Layout():
-        raise InputError(
-            "--time, --columns, --scale, --time-scale, --sort and --turn say how files are read: "
-            "give files, or leave them out"
-        )
+    elif layout != layout_of():
+        raise InputError("options such as --time and --scale say how files are read: give files, or leave them out")
     else:
         described.pop("set", None)
         bound = _of_simulated(

@@ -141,6 +141,9 @@ Methods = Annotated[
 ]
 Seeds = Annotated[str | None, typer.Option(metavar="1-5", help="Run these seeds instead of the suite's; or 1,3,7.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Go on, however much time and memory it may take.")]
+HtmlOut = Annotated[
+    Path | None, typer.Option("--html", metavar="OUT", parser=place, help="Write one HTML file with pictures.")
+]
 JsonOut = Annotated[
     str | None,
     typer.Option("--json", metavar="OUT", parser=named, help="Write it as JSON to a file, or - for the screen."),

@@ -69,7 +69,12 @@ TimeScale = Annotated[
 
 
 def layout_of(
-    time: str | None, columns: Sequence[str] | None, scale: str, sort: bool, turn: float, time_scale: str
+    time: str | None = None,
+    columns: Sequence[str] | None = None,
+    scale: str = "1",
+    sort: bool = False,
+    turn: float = 0.0,
+    time_scale: str = "1",
 ) -> Layout:
     """Return the layout that the options describe.
 
