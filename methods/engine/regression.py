@@ -57,7 +57,9 @@ class Regression:
         if self.left_out:
             return f"{self.left_out} of {self.left_out + self.size} rows left out: a term is not finite there"
         count = self.design.shape[1]
-        rank = int(np.linalg.matrix_rank(self.design / self.scales, tol=1e-12 * np.sqrt(self.size * count)))
+        # Of columns of RMS 1, whatever the unit of y.
+        scaled = self.design / (self.scales * (self.height or 1.0))
+        rank = int(np.linalg.matrix_rank(scaled, tol=1e-12 * np.sqrt(self.size * count)))
         if rank < count:
             return f"these data tell only {rank} of {count} terms apart; the coefficients are one choice of many"
         return "ok"
