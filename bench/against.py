@@ -143,7 +143,8 @@ def critical_difference(methods: int, cases: int, level: float = LEVEL) -> float
 def _named(reference: str, names: list[str]) -> str:
     marked = [name for name in names if name == reference] or [name for name in names if name.rstrip("*") == reference]
     if not marked:
-        raise unknown("method", reference, names, "--against")
+        error = unknown("method", reference, names, "--against")
+        raise InputError(f"{error}; --with DIR brings those of a published run")
     return marked[0]
 
 

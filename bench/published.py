@@ -21,6 +21,13 @@ def folder_of(name: str) -> Path:
     return Path(__file__).resolve().parents[1] / "results" / name
 
 
+def without_results() -> str:
+    """Return what to know of published runs where none are there, a part of a sentence; empty where some are."""
+    if folder_of("").is_dir():
+        return ""
+    return "; published runs are in results/ of the project's repository, which no package has: give their path"
+
+
 def read_head(path: Path) -> dict[str, str]:
     """Return the provenance in the head of a published table, by name; empty where there is none.
 

@@ -13,7 +13,7 @@ import pandas as pd
 
 from latticebench import methods
 from latticebench.bench.fitting import described
-from latticebench.bench.published import read_table
+from latticebench.bench.published import read_table, without_results
 from latticebench.bench.store import FILE, is_store, open_store
 from latticebench.systems.errors import InputError
 
@@ -215,7 +215,10 @@ def read_cases(path: Path) -> pd.DataFrame:
             return cases(store.results(kind="fit"))
     path = file_of_cases(path)
     if not os.path.isfile(path):
-        raise InputError(f"{path}: no such table; give a store of results, a folder with cases.csv, or a cases.csv")
+        raise InputError(
+            f"{path}: no such table; give a store of results, a folder with cases.csv, or a cases.csv"
+            f"{without_results()}"
+        )
     table = read_table(path, (*SCORES, "covered", "noise", "seed"))
     missing = [name for name in ("identity", "status", "e2") if name not in table]
     if missing:

@@ -253,13 +253,14 @@ def results(name: str | Path) -> Tables:
         >>> tables["cases"]["e2"].dtype
         dtype('float64')
     """
-    from latticebench.bench.published import folder_of, read_table
+    from latticebench.bench.published import folder_of, read_table, without_results
 
     folder = Path(name) if os.path.isdir(name) else folder_of(str(name))
     paths = sorted(folder.glob("*.csv"))
     if not paths:
         raise InputError(
             f"{name}: there are no published tables; give a folder with .csv files of `latticebench table`"
+            f"{without_results()}"
         )
     found = {path.stem: read_table(path) for path in paths}
     return Tables({key: frame.apply(_numbers) for key, frame in found.items()})
@@ -306,8 +307,8 @@ class Run:
 def run(
     suite: str | Path,
     *,
-    only: Sequence[str] = (),
-    methods: Sequence[str | Path] = (),
+    only: str | Sequence[str] = (),
+    methods: str | Path | Sequence[str | Path] = (),
     seeds: str | Sequence[int] | None = None,
     jobs: int = 1,
     folder: str | Path | None = None,
@@ -316,8 +317,9 @@ def run(
 
     Args:
         suite: a name from `latticebench list suites`, or a .toml file.
-        only: patterns such as "phi4*"; cases whose title, part, system, library, method or effect is so.
-        methods: in place of the suite's: its labels, names from `latticebench list methods`, or .py files.
+        only: a pattern such as "phi4*", or several; cases whose title, part, system, library, method or effect is so.
+        methods: in place of the suite's: one of its labels, a name from `latticebench list methods`, a .py file, or
+            several of these.
         seeds: in place of the suite's, such as "1-5" or [1, 3, 7].
         jobs: worker processes.
         folder: where results are kept; runs/SUITE if not given.
@@ -338,7 +340,9 @@ def run(
     from latticebench.bench.store import create
     from latticebench.bench.suite import load
 
-    choice = chosen(only, map(str, methods), seeds)
+    patterns = [only] if isinstance(only, str) else only
+    contestants = [methods] if isinstance(methods, (str, Path)) else methods
+    choice = chosen(patterns, map(str, contestants), seeds)
     loaded = load(str(suite), choice=choice)
     place = Path(folder) if folder is not None else Path("runs") / loaded.name
     about = {"command": FROM_PYTHON, **loaded.about, "jobs": jobs, "chosen": str(choice)}

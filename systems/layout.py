@@ -315,6 +315,8 @@ def suggestion(header: Sequence[str], layout: Layout) -> str:
         return '; name the columns with --time and --columns, such as --time time_s --columns "theta_*_deg"'
     unit = unit_of(members[0])
     scale = f" --scale {unit}" if unit in ("deg", "arcmin") and layout.scale == "1" else ""
+    if unit_of(time) in set(TIMES) - {"s"} and layout.time_scale == "1":
+        scale += f" --time-scale {unit_of(time)}"
     options = ("" if time == "t" else f" --time {_argument(time)}") + f' --columns "{pattern}"{scale}'
     return f"; read it with{options}"
 

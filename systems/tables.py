@@ -207,7 +207,9 @@ def _with_points(raw: pandas.DataFrame) -> bool:
 
 
 def read_sheet(path: Path, layout: Layout) -> Table:
-    """Return the first table of a spreadsheet (.xlsx), with the values that its formulas had when it was saved.
+    """Return a table of a spreadsheet (.xlsx), with the values that its formulas had when it was saved.
+
+    It is the first sheet that names the column of the times, or the first of all.
 
     Raises:
         InputError: it is no spreadsheet, or holds no table.
@@ -224,27 +226,26 @@ def read_sheet(path: Path, layout: Layout) -> Table:
                     f"if it is meant to be so long, raise that with --largest-file or {LARGEST}"
                 )
             handle.seek(0)
-            rows, notes = _rows_of_sheet(handle, path)
+            rows, notes = _rows_of_sheet(handle, path, layout.time or "t")
     except InputError:
         raise
     # A damaged file fails in many ways: zipfile's, the XML parser's, openpyxl's.
     except Exception as error:
         raise InputError(f"{shown(path)}: not a spreadsheet: {str(error).partition(chr(10))[0]}") from None
     first = [[cell or "" for cell in row] for row in rows[:MOST_HEAD]]
-    time = layout.time or "t"
-    number = _head(first, lambda row: time in row, equal=False)
+    number = _head(first, lambda row: (layout.time or "t") in row, equal=False)
     if number is None:
         number = _head(first, lambda row: not any(NUMBER.fullmatch(cell) for cell in row), equal=True) or 0
     skipped = sum(1 for row in first[:number] if any(row))
     return _with_header(pd.DataFrame(rows[number:], dtype=object), path, (*_skipped(skipped), *notes))
 
 
-def _rows_of_sheet(handle: Any, path: Path) -> tuple[list[list[str | None]], list[str]]:
-    """Return the cells of the first sheet as texts, and what is to be said of it."""
+def _rows_of_sheet(handle: Any, path: Path, time: str) -> tuple[list[list[str | None]], list[str]]:
+    """Return the cells of the sheet with the times as texts, and what is to be said of it."""
     import openpyxl
 
     book = openpyxl.load_workbook(handle, read_only=True, data_only=True)
-    sheet = book.worksheets[0]
+    sheet = next((one for one in book.worksheets if _names(one, time)), book.worksheets[0])
     rows: list[list[str | None]] = []
     cells = 0
     for row in sheet.iter_rows(values_only=True):
@@ -257,9 +258,14 @@ def _rows_of_sheet(handle: Any, path: Path) -> tuple[list[list[str | None]], lis
             f"{shown(path)}: sheet {quoted(sheet.title)} has {len(rows)} row(s); it needs a header and data"
         )
     width = max(len(row) for row in rows)
-    others = [one.title for one in book.worksheets[1:]]
+    others = [one.title for one in book.worksheets if one is not sheet]
     notes = [f"sheet {quoted(sheet.title)} is read, not {', '.join(map(quoted, others))}"] if others else []
     return [[*row, *[None] * (width - len(row))] for row in rows], notes
+
+
+def _names(sheet: Any, name: str) -> bool:
+    """Return whether one of the first rows of a sheet has a cell with a name."""
+    return any(name in map(_written, row) for row in sheet.iter_rows(max_row=MOST_HEAD, values_only=True))
 
 
 def _written(cell: Any) -> str:

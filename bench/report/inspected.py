@@ -46,7 +46,7 @@ def lines(found: Inspection, time: str) -> list[str]:
     return [
         f"{extent(found.sites, found.rows)}{seen}; {span}, {every}",
         *(f"gap from t = {begin:g} to {end:g}" for begin, end in found.gaps),
-        f"main frequencies{f' in 1/{time}' if time else ''}: {frequencies or 'none stands out'}",
+        f"main frequencies in cycles per {time or 'unit of time'}: {frequencies or 'none stands out'}",
     ]
 
 
@@ -60,7 +60,16 @@ def sensors(found: Inspection, unit: str) -> Table:
         for site, one in enumerate(found.sensors, 1)
     ]  # fmt: skip
     inside = f" ({unit})" if unit else ""
-    return ["site", "column", "readings", "missing", f"least{inside}", f"most{inside}", "noise", "steps"], rows
+    return [
+        "site",
+        "column",
+        "readings",
+        "missing",
+        f"least{inside}",
+        f"most{inside}",
+        f"noise{inside}",
+        f"steps{inside}",
+    ], rows
 
 
 def picture(samples: Samples, figure: Figure | None = None) -> Figure:

@@ -68,6 +68,9 @@ def degrees(samples: Samples, terms: Library) -> list[str]:
     if largest <= ANGLE:
         return []
     unit = samples.origin.unit
+    # Radians of several turns are what a pendulum does that goes round.
+    if samples.origin.becomes == "rad":
+        return []
     known = unit in ("deg", "arcmin")
     remedy = f"read the angles with --scale {unit}" if known else "if these are degrees: --scale deg"
     return [f"u reaches {largest:.3g} in {names[0]}(...), which takes radians; {remedy}"]

@@ -101,7 +101,7 @@ def modes(report: Report) -> Table:
     """
     unit = report.recording.units.time
     time = f" ({unit})" if unit else ""
-    peak = f"peak of the recording{f' (1/{unit})' if unit else ''}"
+    peak = f"peak of the recording{f' (rad/{unit})' if unit else ''}"
     columns = [peak, "mode before", "mode after", f"decay time before{time}", f"decay time after{time}"]
     every, rows = report.modes, []
     places = [one.frequency for one in every.recording] or [one.frequency for one in every.after]

@@ -1,12 +1,15 @@
-"""Measure what limits, leases and the store cost a run: the same cases with them and without, side by side.
+"""Measure what limits, leases and the store cost a run: the same cases with them and without.
 
-    python results/scale/walls.py [SUITE ...]
+    python results/scale/walls.py [default] [trivial]
 
-runs the suite `default` and 10 000 trivial cases (`zero`, which fits nothing), and writes walls.csv and walls.md.
+runs the suite `default` and 10 000 trivial cases (`zero`, which fits nothing), or one of both, and writes walls.csv and
+walls.md; rows of the other are kept.
 
 `with` is `latticebench run SUITE --jobs 1`; `without` is one process that runs the cases one after another, keeps
-nothing and has no limits of time or memory. Both begin at the same moment, each on a core of its own, so that what else
-the machine does slows both. Seconds are of the clock, from the start of the process to its end.
+nothing and has no limits of time or memory. In the suite `default` both begin at the same moment, each on a core of its
+own, so that what else the machine does slows both. Trivial cases are run with and without in turns, since the process
+that keeps their results needs a part of another core. Seconds are of the clock, from the start of the process to its
+end.
 """
 
 from __future__ import annotations
@@ -15,12 +18,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import pandas as pd
 
-from latticebench.bench.provenance import lines, origin
+from latticebench.bench.provenance import commit, lines, origin
 from latticebench.bench.publish import markdown_list, markdown_table, render
+from latticebench.bench.published import read_table
 from latticebench.bench.suite import load
 from latticebench.bench.worker import attempt
 from latticebench.systems.files import write_text
@@ -47,41 +52,48 @@ def without(suite: str) -> None:
         attempt(case, cases.folders)
 
 
-def side_by_side(suite: str, results: Path) -> tuple[float, float]:
-    """Return the seconds that the cases of a suite take with walls and without."""
+def started(suite: str, results: Path, *, walls: bool) -> subprocess.Popen[bytes]:
+    """Start a process that runs the cases of a suite, with walls or without."""
     program = [sys.executable, "-m", "latticebench", "run", suite, "--jobs", "1", "--yes", "--results", str(results)]
-    begin = time.perf_counter()
-    waiting = {
-        name: subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        for name, command in (("with", program), ("without", [sys.executable, __file__, "--without", suite]))
-    }
-    took: dict[str, float] = {}
-    while waiting:
-        for name, process in list(waiting.items()):
-            if process.poll() is not None:
-                took[name] = time.perf_counter() - begin
-                if waiting.pop(name).returncode:
-                    raise SystemExit(f"{suite}, {name} walls: exit code {process.returncode}")
-        time.sleep(0.05)
-    return took["with"], took["without"]
+    command = program if walls else [sys.executable, __file__, "--without", suite]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-def measured(suites: list[str]) -> pd.DataFrame:
-    """Return the table of all pairs; the results of the runs are kept in runs/walls."""
-    rows, kept = [], Path("runs") / "walls"
-    if kept.exists():
-        raise SystemExit(f"{kept} is there: a run would go on from its results; move it away")
+def finished(processes: Mapping[bool, subprocess.Popen[bytes]], begin: float) -> dict[bool, float]:
+    """Return the seconds from a moment to the end of each process."""
+    took: dict[bool, float] = {}
+    while len(took) < len(processes):
+        for walls, process in processes.items():
+            if walls not in took and process.poll() is not None:
+                took[walls] = time.perf_counter() - begin
+                if process.returncode:
+                    raise SystemExit(f"{'with' if walls else 'without'} walls: exit code {process.returncode}")
+        time.sleep(0.02)
+    return took
+
+
+def measured(part: str, kept: Path) -> list[dict[str, object]]:
+    """Return the rows of a part; results of `default` are kept."""
+    rows: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory() as name:
-        trivial = Path(name) / "trivial.toml"
-        trivial.write_text(SUITE)
-        for number, suite in enumerate(suites or ["default", *[str(trivial)] * TIMES], 1):
-            walled, bare = side_by_side(suite, kept / f"{Path(suite).stem}-{number}")
+        suite = "default" if part == "default" else str(Path(name) / "trivial.toml")
+        if part == "trivial":
+            Path(suite).write_text(SUITE)
+        cases = len(load(suite).by_identity)
+        for number in range(1 if part == "default" else TIMES):
+            begin = time.perf_counter()
+            if part == "default":
+                took = finished({walls: started(suite, kept, walls=walls) for walls in (True, False)}, begin)
+            else:
+                took = finished({False: started(suite, kept, walls=False)}, begin)
+                begin = time.perf_counter()
+                took |= finished({True: started(suite, Path(name) / str(number), walls=True)}, begin)
             rows.append({
-                "suite": Path(suite).stem, "cases": len(load(suite).by_identity), "with": round(walled, 1),
-                "without": round(bare, 1), "slower": f"{100 * (walled / bare - 1):.1f} %",
+                "suite": part, "cases": cases, "with": round(took[True], 1), "without": round(took[False], 1),
+                "slower": f"{100 * (took[True] / took[False] - 1):.1f} %", "commit": commit(),
             })  # fmt: skip
             print(rows[-1], flush=True)
-    return pd.DataFrame(rows)
+    return rows
 
 
 def main() -> None:
@@ -89,10 +101,17 @@ def main() -> None:
     if sys.argv[1:2] == ["--without"]:
         without(sys.argv[2])
         return
-    table = measured(sys.argv[1:])
+    parts, kept = sys.argv[1:] or ["default", "trivial"], Path("runs") / "walls"
+    if "default" in parts and kept.exists():
+        raise SystemExit(f"{kept} is there: a run would go on from its results; move it away")
+    rows = [row for part in parts for row in measured(part, kept)]
+    table = pd.DataFrame(rows)
+    if (HERE / "walls.csv").exists():
+        before = read_table(HERE / "walls.csv")
+        table = pd.concat([before[~before["suite"].isin(parts)], table], ignore_index=True).sort_values("suite")
     about = {"command": " ".join(["python results/scale/walls.py", *sys.argv[1:]]), **origin()}
     write_text(HERE / "walls.csv", render(table, about, "csv"))
-    text = (__doc__ or "").split("walls.md.\n")[1].strip()
+    text = (__doc__ or "").split("are kept.\n")[1].strip()
     provenance = "".join(f"{line}\n" for line in markdown_list(lines(about)))
     shown = table.rename(columns={"with": "seconds with", "without": "seconds without"}).astype(str)
     page = "\n\n".join(["# What the walls around a case cost", text, markdown_table(shown), provenance])

@@ -137,6 +137,21 @@ def test_a_spreadsheet_is_read_as_the_table_that_it_holds(tmp_path):
         read(tmp_path / "a.xlsx")
 
 
+def test_of_a_workbook_the_sheet_with_the_times_is_read(tmp_path):
+    book = openpyxl.Workbook()
+    book.active.title = "Notes"
+    book.active.append(["Torsion chain", "lab 3"])
+    book.active.append(["read by", "two of us"])
+    sheet = book.create_sheet("Data")
+    for row in (["t", "u1"], [0, 1.5], [1, 2.5]):
+        sheet.append(row)
+    book.create_sheet("More").append(["t"])
+    book.save(tmp_path / "a.xlsx")
+    (one,) = read(tmp_path / "a.xlsx")
+    assert one.u[:, 0].tolist() == [1.5, 2.5]
+    assert "sheet 'Data' is read, not 'Notes', 'More'" in one.origin.notes
+
+
 def test_a_parquet_with_other_columns_and_a_frame_are_read(tmp_path):
     frame = pd.DataFrame(
         {"time_s": [0.0, 0.5, 1.0], "theta_1_deg": U[:, 0], "theta_2_deg": U[:, 1], "temperature": list("abc")}
@@ -154,6 +169,11 @@ def test_what_cannot_be_read_as_it_is_names_the_options_that_read_it(tmp_path):
     options = '--time time_s --columns "theta_*_deg" --scale deg'
     assert options in str(caught.value)
     assert_pendula(path)
+
+
+def test_the_options_that_read_a_table_turn_its_times_into_seconds(tmp_path):
+    with pytest.raises(InputError, match=r'--time t_ms --columns "x\*" --time-scale ms'):
+        read(written(tmp_path, "t_ms,x1,x2\n0,1,2\n1,2,3\n"))
 
 
 def test_times_that_do_not_increase_are_refused_with_the_option_that_sorts_them(tmp_path):
