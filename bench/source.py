@@ -25,6 +25,8 @@ from latticebench.systems import packages
 from latticebench.systems.errors import unknown
 
 PACKAGE = "latticebench"
+# Where a statement holds others.
+BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")
 # Hexadecimal digits of a key: 128 bits.
 DIGITS = 32
 
@@ -108,19 +110,12 @@ def _module_file(name: str) -> Path:
 
 
 @functools.lru_cache(maxsize=1024)
-def _imports(path: Path, changed: int) -> frozenset[Path]:  # noqa: ARG001
+def _imports(path: Path, changed: int) -> frozenset[Path]:
     """Return the files of this package that a file imports, anywhere in it; `changed` renews the memory."""
-    if path.suffix != ".py":
-        return frozenset()
-    text = path.read_bytes()
-    tree = _tree(text)
     # A package that looks its modules up uses all of them.
-    found = set(path.parent.glob("*.py")) if path.name == "__init__.py" and b"iter_modules" in text else set()
-    try:
-        names = [] if tree is None else list(_names(tree))
-    except RecursionError:
-        names = []
-    for name in names:
+    looks = path.name == "__init__.py" and b"iter_modules" in path.read_bytes()
+    found = set(path.parent.glob("*.py")) if looks else set()
+    for name in _read(path, changed)[1]:
         parts = name.split(".")
         # The __init__ of a room looks its modules up by name and computes nothing.
         for length in range(3, len(parts) + 1 if parts[0] == PACKAGE else 0):
@@ -130,6 +125,33 @@ def _imports(path: Path, changed: int) -> frozenset[Path]:  # noqa: ARG001
                 # The name of something in a module.
                 break
     return frozenset(found)
+
+
+def _digest(path: Path, changed: int) -> str:
+    return _read(path, changed)[0]
+
+
+@functools.lru_cache(maxsize=1024)
+def _read(path: Path, changed: int) -> tuple[str, tuple[str, ...]]:  # noqa: ARG001
+    """Return the hash of a file, and the names that it may import."""
+    content = path.read_bytes()
+    tree = _tree(content) if path.suffix == ".py" else None
+    if tree is None:
+        return hashlib.sha256(content).hexdigest(), ()
+    names = tuple(_names(tree))
+    for node in _statements(tree, types=True):
+        if (
+            isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
+            and node.body
+            and isinstance(node.body[0], ast.Expr)
+            and isinstance(node.body[0].value, ast.Constant)
+            and isinstance(node.body[0].value.value, str)
+        ):
+            node.body = node.body[1:]
+    # What is nested too deeply counts as it is.
+    with suppress(RecursionError):
+        content = ast.dump(tree).encode()
+    return hashlib.sha256(content).hexdigest(), names
 
 
 def _tree(content: bytes) -> ast.Module | None:
@@ -142,32 +164,21 @@ def _tree(content: bytes) -> ast.Module | None:
         return None
 
 
-def _names(node: ast.AST) -> Iterator[str]:
-    """Return the names that a piece of source may import, but for what only a type checker reads."""
-    if isinstance(node, ast.Import):
-        yield from (alias.name for alias in node.names)
-    elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-        yield from (f"{node.module}.{alias.name}" for alias in node.names)
-    only_types = isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-    for child in node.orelse if isinstance(node, ast.If) and only_types else ast.iter_child_nodes(node):
-        yield from _names(child)
+def _names(tree: ast.Module) -> Iterator[str]:
+    """Return the names that a file may import, but for what only a type checker reads."""
+    for node in _statements(tree, types=False):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-@functools.lru_cache(maxsize=1024)
-def _digest(path: Path, changed: int) -> str:  # noqa: ARG001
-    content = path.read_bytes()
-    if path.suffix == ".py":
-        tree = _tree(content)
-        for node in ast.walk(tree) if tree is not None else ():
-            if (
-                isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
-                and node.body
-                and isinstance(node.body[0], ast.Expr)
-                and isinstance(node.body[0].value, ast.Constant)
-                and isinstance(node.body[0].value.value, str)
-            ):
-                node.body = node.body[1:]
-        # What is nested too deeply counts as it is.
-        with suppress(RecursionError):
-            content = content if tree is None else ast.dump(tree).encode()
-    return hashlib.sha256(content).hexdigest()
+def _statements(tree: ast.Module, *, types: bool) -> Iterator[ast.AST]:
+    """Return a file and its statements at any depth, those that only a type checker reads if `types` is set."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        only_types = isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        for name in BLOCKS[1:] if only_types and not types else BLOCKS:
+            waiting += getattr(node, name, ())

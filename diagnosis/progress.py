@@ -41,8 +41,10 @@ class Found:
         before: the declared equation on the longest horizon on which it could be followed.
         models: the best models on the last horizon, the best first.
         horizons: those that were gone through.
+        whole: whether the last one is the whole recordings, or as much of them as unknown ends allow.
     """
 
     before: Fitted
     models: tuple[Fitted, ...]
     horizons: tuple[Horizon, ...]
+    whole: bool = False

@@ -38,7 +38,7 @@ One = TypeVar("One")
 
 # Why named effects may explain only a part.
 SMALL, NAMELESS = "something small is left", "something without a name does better"
-NOT_REACHED = "the readings are not reached"
+NOT_REACHED, NOT_FOLLOWED = "the readings are not reached", "the recording is followed in pieces only"
 # Readings beyond twice the number of unknowns that a diagnosis needs.
 SPARE = 10
 # Bytes for each row and each pair of numbers of a state, at least: a fit has some two dozen derivatives by the start.
@@ -53,6 +53,7 @@ class Diagnosis:
         before, after: the declared equation, and with all that was found.
         findings: the effects of the last model.
         verdict: "nothing missing", "explained", "partly explained" or "unexplained".
+        whole: whether the last model follows whole recordings, or as much of them as unknown ends allow.
         horizons: how the search went.
         left: what is significant in the last residual without having a name, the best first.
         data: recordings as they were used.
@@ -75,6 +76,7 @@ class Diagnosis:
     after: Fitted
     findings: tuple[Finding, ...]
     verdict: str
+    whole: bool
     horizons: tuple[Horizon, ...]
     left: tuple[Left, ...]
     data: tuple[Samples, ...]
@@ -119,11 +121,14 @@ class Interrupted(Exception):
 
 
 def shortfalls(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return why what is named explains only a part: SMALL, NAMELESS, NOT_REACHED; nothing with another verdict."""
-    if not diagnosis.findings or not diagnosis.left:
+    """Return why what is named explains only a part, in the words above; nothing with another verdict."""
+    if diagnosis.verdict != "partly explained":
         return ()
     rivals, reached = [bool(one.instead) for one in diagnosis.left], diagnosis.residual[1] <= rules.LOST
-    found = {SMALL: reached and not all(rivals), NAMELESS: any(rivals), NOT_REACHED: not reached}
+    found = {
+        SMALL: reached and not all(rivals), NAMELESS: any(rivals), NOT_REACHED: not reached,
+        NOT_FOLLOWED: not diagnosis.whole,
+    }  # fmt: skip
     return tuple(words for words, holds in found.items() if holds)
 
 
@@ -278,7 +283,7 @@ def _diagnosis(
         return function(before), function(after)
 
     return Diagnosis(
-        before, after, named, _verdict(named, left), found.horizons, left, problem.data,
+        before, after, named, _verdict(named, left, found.whole), found.whole, found.horizons, left, problem.data,
         (sum(len(one.t) for one in problem.data), recorded), noise, _noise_lines(problem, after),
         residual=both(lambda one: _over(one, noise)),
         rms=both(lambda one: float(np.sqrt(np.nanmean(one.followed.left**2)))),
@@ -291,9 +296,9 @@ def _diagnosis(
     )  # fmt: skip
 
 
-def _verdict(named: Sequence[Finding], left: Sequence[Left]) -> str:
+def _verdict(named: Sequence[Finding], left: Sequence[Left], whole: bool) -> str:
     if named:
-        return "partly explained" if left else "explained"
+        return "explained" if whole and not left else "partly explained"
     return "unexplained" if left else "nothing missing"
 
 

@@ -107,7 +107,7 @@ class Search:
             models = tuple((_names(one.model), self.value(one) - base) for one in best)
             done = (*done, Horizon(best[0].longest, waves, models, self.tried.get(best[0].model.key, ())))
             settled = last is not None and last.models[0].model.key == best[0].model.key
-            last = Found(before, tuple(best), done)
+            last = Found(before, tuple(best), done, whole)
             yield last
             further = self._further(length, settled)
             followed = [one for one in (before, *best) if one.longest == best[0].longest]

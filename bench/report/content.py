@@ -21,7 +21,7 @@ from latticebench.bench.report.shown import Shown
 from latticebench.bench.report.units import Units, in_sentence, noise_in_words, units_of
 from latticebench.bench.report.whereabouts import Whereabouts, whereabouts
 from latticebench.diagnosis.instrument import step_of, two_digits
-from latticebench.diagnosis.repair import NOT_REACHED, shortfalls
+from latticebench.diagnosis.repair import NOT_FOLLOWED, NOT_REACHED, shortfalls
 from latticebench.methods.engine.dynamics import split_parts
 
 if TYPE_CHECKING:
@@ -221,15 +221,21 @@ def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
         said.append(
             f"Something without a name, {best.name}{where}, does better in the place of {_listed(best.instead)}."
         )
-    lost = NOT_REACHED in shortfalls(diagnosis)
+    short = shortfalls(diagnosis)
+    lost = NOT_REACHED in short
     if len(rivals) < len(diagnosis.left):
         size = "" if lost else f"; in all, the model leaves {diagnosis.residual[1]:.3g} times the noise"
         if diagnosis.residual[1] < REACHED:
             size = "; it is small, since the model comes down to the noise"
         said.append(f"Something more is left that nothing in the catalogue explains{size}.")
-    elif not rivals:
+    elif diagnosis.whole and not rivals:
         them = "it" if len(names) == 1 else "them"
         said.append(f"With {them}, nothing significant is left.")
+    if NOT_FOLLOWED in short:
+        said.append(
+            f"Even so, it is followed over pieces of {diagnosis.after.longest} samples only: over longer ones it loses "
+            "the readings, so the names are in doubt."
+        )
     if lost:
         said.append(
             f"The model does not reach the readings: it leaves {two_digits(diagnosis.residual[1])} times their noise."

@@ -258,7 +258,8 @@ def _hum(diagnosis: Diagnosis) -> Iterator[str]:
 
 def _of_the_fits(diagnosis: Diagnosis) -> Iterator[str]:
     for fitted, name in ((diagnosis.before, "declared equation"), (diagnosis.after, "last model")):
-        if fitted.pieces > len(diagnosis.data) and (fitted is diagnosis.after or diagnosis.findings):
+        last = fitted is diagnosis.after
+        if fitted.pieces > len(diagnosis.data) and (last or diagnosis.findings) and not (last and diagnosis.whole):
             yield (
                 f"The {name} is followed in {fitted.pieces} pieces of at most {fitted.longest} samples, each from a "
                 "start of its own: over longer ones it loses the readings."

@@ -23,7 +23,7 @@ from latticebench.bench.report.whereabouts import scaled_residuals, whereabouts
 from latticebench.diagnosis.acting import Chain, Placed
 from latticebench.diagnosis.acting.everywhere import Everywhere
 from latticebench.diagnosis.noise import Noise
-from latticebench.diagnosis.repair import NAMELESS, NOT_REACHED, SMALL
+from latticebench.diagnosis.repair import NAMELESS, NOT_FOLLOWED, NOT_REACHED, SMALL
 from latticebench.systems.effects import CATALOGUE, Effect, find
 from latticebench.systems.samples import Origin, Samples
 
@@ -175,6 +175,13 @@ def test_what_is_left_is_not_called_small_where_the_readings_are_not_reached(pen
     assert content(pendula(findings=(), left=(left,), verdict="unexplained")).partly == ()
 
 
+def test_a_model_that_loses_longer_pieces_puts_its_names_in_doubt(pendula: Made) -> None:
+    report = content(pendula(whole=False, verdict="partly explained"))
+    assert report.partly == (NOT_FOLLOWED,)
+    assert "nothing significant is left" not in report.sentence
+    assert re.search(r"over pieces of \d+ samples only: .*the names are in doubt\.$", report.sentence)
+
+
 def test_the_terminal_shows_equation_search_errors_and_what_would_separate(
     pendula: Made, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -239,7 +246,7 @@ def test_it_is_noted_what_was_thinned_cut_into_pieces_or_not_followed_to_the_end
     after = pendula().after
     inner = Chain(**{**vars(after.chain), "ends": "unknown", "moving": (1,)})
     worse = SimpleNamespace(**{**vars(after), "pieces": 3, "longest": 300, "converged": False, "chain": inner})
-    found = " ".join(notes(pendula(after=worse, used=(800, 4000))))
+    found = " ".join(notes(pendula(after=worse, used=(800, 4000), whole=False)))
     for words in (
         "last model is followed in 3 pieces of at most 300", "Of 4000 sample times 800", "steps did not end",
         "ends were not declared",
