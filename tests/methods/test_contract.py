@@ -111,6 +111,9 @@ def test_a_fit_has_one_finite_coefficient_a_term_and_is_timed(name: str, data: s
     if fit.history is not None:
         assert fit.history.coefficients.shape == (len(fit.history.step), len(candidates.terms))
         assert np.all(np.diff(fit.history.step) > 0)
+        assert np.all(np.diff(fit.history.seconds) >= 0)
+        assert fit.history.seconds[0] >= 0
+        assert fit.history.seconds[-1] <= fit.seconds
 
 
 @pytest.mark.parametrize("name", METHODS)

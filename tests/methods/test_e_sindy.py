@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from latticebench import methods
-from latticebench.methods.e_sindy import ESINDy, bag
+from latticebench.methods.e_sindy import Ensemble, ESINDy, bag
 from latticebench.methods.engine.regression import Regression
 from latticebench.methods.method import make, solve
 from latticebench.systems.errors import InputError
@@ -77,3 +77,17 @@ def test_settings_out_of_range_are_refused() -> None:
     for given in ({"models": 1}, {"inclusion": 0.0}, {"thresholds": ()}, {"dropped": -1}):
         with pytest.raises(InputError, match="e-sindy"):
             make(ESINDy, given)
+
+
+def test_the_bags_of_rows_are_drawn_apart_from_those_of_terms(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[tuple[int, int]] = []
+
+    def watched(regression: Regression, threshold: float, models: int, dropped: int, seed: int) -> Ensemble:
+        drawn.append((dropped, seed))
+        return bag(regression, threshold, models, dropped, seed)
+
+    monkeypatch.setattr("latticebench.methods.e_sindy.bag", watched)
+    rng = np.random.default_rng(3)
+    design = rng.normal(size=(50, 3))
+    ESINDy(dropped=1, models=5).bagged(Regression(design, design @ [1.0, -0.7, 0.0]), 0.05, seed=4)
+    assert drawn == [(1, 4), (0, 5)]

@@ -190,3 +190,12 @@ def test_a_time_in_which_no_site_that_moves_was_seen_adds_nothing_and_takes_noth
     u[-8:, 0] = np.nan
     fit = solve(Trajectory(), [Samples(t, u)], library("own", "i*u[n]; i*u[n+1]"), 1, 0)
     np.testing.assert_allclose(fit.coefficients, [-1.0, 0.3], atol=1e-3)
+
+
+def test_selection_goes_down_to_a_single_term():
+    t = np.linspace(0, 8, 161)
+    u = np.cos(1.5 * t) + 0.01 * np.random.default_rng(2).normal(size=len(t))
+    samples = Samples(t, u[:, None], ends="free")
+    fit = solve(Trajectory(select=True), [samples], library("two", "u[n]; v[n]"), 2, 0)
+    np.testing.assert_array_equal(fit.coefficients != 0, [True, False])
+    assert fit.coefficients[0] == pytest.approx(-2.25, abs=0.02)

@@ -63,3 +63,16 @@ def test_settings_out_of_range_and_too_few_samples_are_refused() -> None:
     t = np.linspace(0, 1, 7)
     with pytest.raises(InputError, match="too few samples for a window, there are 7"):
         fit(Samples(t, np.cos(t)[:, None] * np.ones(3)), "u[n]", 2, finer=(1,))
+
+
+def test_a_damping_is_found_where_velocities_were_not_read() -> None:
+    t = np.linspace(0, 20, 401)
+    u = np.exp(-0.05 * t) * np.cos(2 * t)
+    found = fit(Samples(t, u[:, None], ends="free"), "u[n]; v[n]", 2)
+    np.testing.assert_allclose(found.coefficients, [-4 - 0.05**2, -0.1], rtol=0.02)
+
+
+def test_a_window_is_never_narrower_than_a_few_samples() -> None:
+    t = np.linspace(0, 8, 161)
+    narrow = fit(Samples(t, np.cos(2 * t)[:, None], ends="free"), "u[n]", 2, widths=(1e-6,), finer=(1,))
+    np.testing.assert_allclose(narrow.coefficients, [-4], rtol=0.05)

@@ -113,3 +113,18 @@ def test_time_velocity_and_input_reach_the_terms_that_name_them():
 def test_a_library_with_what_was_not_observed_is_refused(name):
     with pytest.raises(InputError, match=f"{name}1..{name}N"):
         evaluate([Term(f"{name}[n]")], np.ones((2, 3)), None, None, np.arange(2.0), ends="free")
+
+
+@pytest.mark.parametrize("reach", [(1, 1), (2, 1), (0, 2)])
+@pytest.mark.parametrize("ends", ["unknown", *ENDS])
+def test_windows_read_the_sites_that_their_stencils_reach_and_no_others(reach, ends):
+    stencil = Stencil.chain(40, reach, ends)
+    for window in stencil.windows(5):
+        sites = np.arange(40)[window.sites]
+        assert 0 < len(sites) <= 5
+        read = np.arange(40)[window.columns]
+        assert len(window.place) == len(sites) + sum(reach)
+        # Beyond an end that is not unknown, a site may be read as another's ghost.
+        inner = sites[0] >= reach[0] and sites[-1] + reach[1] < 40
+        if inner:
+            assert read.tolist() == list(range(sites[0] - reach[0], sites[-1] + reach[1] + 1))
