@@ -52,6 +52,8 @@ CREATE TABLE IF NOT EXISTS runs (owner TEXT PRIMARY KEY, until REAL NOT NULL, co
 # What reading or writing a file of SQLite raises; a text in it that is not UTF-8 is no error of its own.
 FAILURES = (sqlite3.Error, UnicodeError)
 CHOOSE = "choose another place with --results"
+# A fit of fewer seconds is had again sooner than a disk has written thousands of them one by one.
+QUICK = 0.1
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,8 @@ class Store:
     def put(self, key: str, case: Case, result: Mapping[str, Any], made: Mapping[str, Any]) -> None:
         """Keep a result at once, in place of an earlier one; the order of its terms is that of the library.
 
+        Whatever ends the process, the result is kept; that of a quick fit may be lost when the machine fails.
+
         Args:
             key: see `bench.source.keys`.
             case: what was run.
@@ -101,7 +105,8 @@ class Store:
         history = content.pop("history", None)
         seed = getattr(case, "seed", None)
         texts = [None if value is None else json.dumps(value, allow_nan=False) for value in (made, content, history)]
-        with self.writing() as cursor:
+        seconds = content.get("seconds")
+        with self.writing(durable=not isinstance(seconds, float) or seconds >= QUICK) as cursor:
             cursor.execute("INSERT OR IGNORE INTO origins (origin) VALUES (?)", texts[:1])
             cursor.execute(
                 "INSERT OR REPLACE INTO results SELECT ?, ?, ?, ?, ?, ?, ?, number, ?, ? FROM origins WHERE origin = ?",
