@@ -54,12 +54,13 @@ class Process:
         # Where in the file what the present case prints begins, and what of it is in the file no more.
         self.place, self.kept = 0, ""
         self.mark = uuid.uuid4().hex
-        self.printed = _nameless_file()
+        self.printed, written = _nameless_file()
         self.process = subprocess.Popen(
             [sys.executable, "-X", "faulthandler", "-c", START, search_path()],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.printed,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=written,
             env={**os.environ, **ONE_THREAD, MARK: self.mark}, start_new_session=True,
         )  # fmt: skip
+        written.close()
         self.guardian = guardian
         guardian.watch_over(self.process.pid, self.mark)
         self.listener = threading.Thread(target=self._listen, args=(events,), daemon=True)
@@ -200,15 +201,18 @@ class Process:
         self.listener.join(timeout=1)
 
 
-def _nameless_file() -> io.FileIO:
-    """Return an empty file that is gone with the last process that has it; writing appends, whoever writes."""
+def _nameless_file() -> tuple[io.FileIO, io.FileIO]:
+    """Return an empty file, to read and to append to, that is gone with the last process that has it.
+
+    It is opened twice: what a worker appends must not move the place from which it is read.
+    """
     handle, name = tempfile.mkstemp(prefix="latticebench-")
     os.close(handle)
-    opened = open(name, "a+b", buffering=0)  # noqa: SIM115
+    read, written = open(name, "r+b", buffering=0), open(name, "ab", buffering=0)  # noqa: SIM115
     # Windows keeps the name as long as the file is open.
     with contextlib.suppress(OSError):
         os.unlink(name)
-    return opened
+    return read, written
 
 
 def _told(code: int) -> str:

@@ -344,7 +344,7 @@ def test_a_file_without_a_header_and_a_workbook_of_several_sheets_are_told_as_su
     book.active.title = "about"
     book.active.append(["who", "when"])
     book.active.append(["me", "today"])
-    book.create_sheet("readings").append(["t", "u1"])
+    book.create_sheet("readings").append(["time_s", "x"])
     book.save(tmp_path / "book.xlsx")
     with pytest.raises(InputError, match=r"there is no column t, .*; sheet 'about' is read, not 'readings'"):
         read(tmp_path / "book.xlsx")
