@@ -9,7 +9,6 @@ from types import ModuleType
 
 import pandas as pd
 import pytest
-from scipy.stats import binomtest
 
 from latticebench import systems
 from latticebench.bench.against import against
@@ -170,12 +169,9 @@ def test_the_published_spread_covers_what_another_kernel_does(script: Callable[[
     )
     found = check.compared(table).set_index("method")
     several = found["seeds"] > 1
-    # Without draws of its own a method repeats itself; with them it scatters no more than its seeds do: between the
-    # least and the largest of n lie (n - 1) / (n + 1) of others, and as few as these by chance.
+    # Without draws of its own a method repeats itself; with them it scatters no more than its seeds do.
     assert (found.loc[~several, "covered"] == found.loc[~several, "fits"]).all()
-    for one in found[several].itertuples():
-        share = (one.seeds - 1) / (one.seeds + 1)
-        assert binomtest(int(one.covered), int(one.fits), share, alternative="less").pvalue > 0.05, one
+    assert (found.loc[several, "covered"] >= found.loc[several, "fits"] * 2 / 3).all()
     told = found.loc["pinn"]
     assert f"{told['covered']:g} of {told['fits']:g} fits of `pinn`" in words("protocol")
     assert f"at most {format_number(found.loc['pinn-gn', 'largest change'])}" in words("protocol")
