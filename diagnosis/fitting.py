@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -251,11 +251,25 @@ class Fitted:
         """Standard errors of the model's numbers."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
+    @functools.cached_property
+    def left(self) -> Float[ndarray, "rows channels"]:
+        """Readings less what the model says and less the zeros that wander, as far as these are known."""
+        return self.noise.still(self.followed.left, self.followed.swing, self.rows)
+
+    def zeros(self, number: int) -> Float[ndarray, "levels parts sites"]:
+        """Return where the zeros that wander are last known to be in a recording, 0 for all others."""
+        begin = sum(rows.size for rows in self.layout.rows[:number])
+        here = slice(begin, begin + self.layout.rows[number].size)
+        walk = (self.followed.left - self.left)[here]
+        chain = self.chain
+        last = [column[np.isfinite(column)][-1:] for column in walk.T]
+        return np.array([np.sum(one) for one in last]).reshape(chain.levels, chain.parts, chain.sites)
+
     @property
     def rms(self) -> Float[ndarray, " sensors"]:
         """Root mean square of what is left at each sensor, in units of the readings; NaN where nothing was read."""
         sensors = int(np.max(self.rows.sensor)) + 1
-        squares = [self.followed.left[:, self.rows.sensor == k] ** 2 for k in range(sensors)]
+        squares = [self.left[:, self.rows.sensor == k] ** 2 for k in range(sensors)]
         return np.array([np.sqrt(np.nanmean(one)) if np.any(np.isfinite(one)) else np.nan for one in squares])
 
     def has_lines(self) -> bool:
@@ -289,6 +303,8 @@ class Fitted:
             begin += rows.size
             level[flat] = self.followed.level[part][valid].reshape(-1, *shape[1:])
             seen[flat] = self.followed.left[part][valid].reshape(-1, *shape[1:]) + level[flat]
+            # Where a zero wanders, the instrument reads the motion from there.
+            level[flat] += np.nan_to_num(self.followed.left - self.left)[part][valid].reshape(-1, *shape[1:])
             level[..., self.layout.plain.border] = np.nan
             nodes, splines = self.followed.nodes[number], self.followed.splines[number]
             field[flat] = fields(self.layout, number, nodes, splines)[1][valid]
@@ -323,7 +339,7 @@ def fit(
     followed = None if path is None else linearised(path, layout)
     if followed is None:
         return None
-    rows = layout.laid_out()
+    rows = replace(layout.laid_out(), walking=model.walking)
     free = _taken(followed, layout, rows)
     noise, cost = _likely(followed, rows, free, structure, noise)
     damping, converged = DAMPING, False
@@ -346,7 +362,8 @@ def fit(
     covariance = solved.covariance() * spread(error, robust, noise.tail) * dispersion
     if not np.all(np.isfinite(covariance)):
         return None
-    return Fitted(layout, followed.path, noise, cost, covariance, dispersion, converged, rows)
+    path = replace(followed.path, model=followed.model.with_walks(noise.walk))
+    return Fitted(layout, path, noise, cost, covariance, dispersion, converged, rows)
 
 
 def spread(error: ndarray, robust: ndarray, tail: float) -> float:

@@ -145,6 +145,8 @@ def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Predi
         predicted = field[:, 0].copy()
         for placed, _ in model.instruments():
             predicted += placed.misread(late, field).added[:, 0]
+        # Nothing is likelier of a zero that wanders than that it stays where it is.
+        predicted += again.zeros(number)[0]
         seen = split_parts(samples.u[cut : cut + MOST_ROWS], samples.is_complex)
         seen[..., problem.plain.border] = np.nan
         forecast = Prediction(late, seen, predicted, 0.0)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain
 from latticebench.diagnosis.border import Border, borders
 from latticebench.diagnosis.model import Assembled, Model
@@ -66,6 +67,7 @@ class Layout:
         least: the smallest size of the noise.
         small: a size of u that does not matter.
         memory: correlation time of the noise, by which the numbers of the curves were chosen.
+        fastest: how far a zero that wanders goes at most, over the size of the noise, per square root of time.
     """
 
     chain: Chain
@@ -80,6 +82,7 @@ class Layout:
     integrator: Literal["dop853", "rk45"] = "dop853"
     least: float = 0.0
     memory: float = 0.0
+    fastest: float = np.inf
 
     @classmethod
     def of(cls, problem: Problem, length: int, most: int | None, small: float, memory: float = 0.0) -> Layout:
@@ -101,7 +104,7 @@ class Layout:
             tuple(found_valid), substeps, small,
             least=max(ROUNDING * min((one for one in problem.steps if one > 0), default=0.0), problem.finest,
                       problem.unrounded),
-            memory=memory,
+            memory=memory, fastest=float(np.sqrt(rules.SLOWER * problem.step)) * problem.main,
         )  # fmt: skip
 
     @property
@@ -126,7 +129,7 @@ class Layout:
         sensor = np.arange(self.chain.levels)[:, None, None] * self.chain.sites + np.arange(self.chain.sites)
         whole = np.broadcast_to(sensor, (self.chain.levels, self.chain.parts, self.chain.sites))
         outer = frozenset(sensor[:, :, self.plain.border].ravel().tolist())
-        return Rows(times, first, whole.ravel(), self.least, outer)
+        return Rows(times, first, whole.ravel(), self.least, outer, fastest=self.fastest)
 
     def resting(self, rest: float) -> Layout:
         """Return the same pieces, where dry friction is viscous below another speed."""

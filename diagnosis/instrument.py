@@ -237,6 +237,7 @@ def describe(
     interval: float | None = None,
     least: float = 0.0,
     time: str = "",
+    span: float | None = None,
 ) -> list[str]:
     """Return the noise in words, a line for each sensor, or one line for all if they are alike.
 
@@ -247,9 +248,11 @@ def describe(
         interval: time from one reading to the next; with it, the correlation over it is said.
         least: the smallest size that was looked for.
         time: unit of the times.
+        span: length of the recording; with it, how far zeros wander is said.
     """
     lines = []
-    for size, memory, step in zip(noise.deviation(), noise.memory, steps, strict=True):
+    walks = noise.walk if len(noise.walk) else np.zeros(len(noise.size))
+    for size, memory, step, walk in zip(noise.deviation(), noise.memory, steps, walks, strict=True):
         most = "at most " if size < AT_LEAST * least else ""
         parts = [f"{most}{two_digits(size)} {unit}".rstrip()]
         if step > COARSE * size:
@@ -257,6 +260,8 @@ def describe(
         if memory > 0:
             near = f" ({two_digits(np.exp(-interval / memory))} from one reading to the next)" if interval else ""
             parts.append(f"correlated over {two_digits(memory)} {time}".rstrip() + near)
+        if span is not None and walk > 0:
+            parts.append(f"a zero that wanders by {two_digits(walk * np.sqrt(span))} {unit}".rstrip())
         if np.isfinite(noise.tail):
             parts.append(f"tails of Student's t with {two_digits(noise.tail)} degrees of freedom")
         if noise.growth > 0:

@@ -88,6 +88,15 @@ class Model:
         """Return the same model, fed with another field at earlier times of each recording."""
         return replace(self, effects=tuple(one.with_past(past) for one in self.effects))
 
+    @property
+    def walking(self) -> frozenset[int]:
+        """The sites whose sensors have zeros that wander."""
+        return frozenset(site for one in self.effects if (site := one.wandering()) is not None)
+
+    def with_walks(self, walk: Float[ndarray, " sensors"]) -> Model:
+        """Return the same model, which says how far zeros wander."""
+        return replace(self, effects=tuple(one.with_walks(walk) for one in self.effects)) if len(walk) else self
+
     def moved(self, numbers: Float[ndarray, " numbers"]) -> Model:
         """Return the same model with other numbers."""
         count = len(self.coefficients)

@@ -11,15 +11,19 @@ are independent and follow Student's t distribution with nu degrees of freedom (
 Assoc. 84, 881, 1989), or the normal distribution. Which of these parts are used is the `Structure`; Schwarz' criterion
 (Ann. Stat. 6, 461, 1978) chooses it.
 
+The zero of a sensor may wander besides, see `walk`; the rest of its noise is then white.
+
 All likelihoods are natural logarithms with their normalising constants, so that those of different structures compare.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from latticebench.diagnosis.walk import Walk
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, Shaped
@@ -47,6 +51,8 @@ class Rows:
         least: the smallest size of the noise.
         curved: sensors of which a free curve takes the slow part of the noise: their own memory, tails and growth
             cannot be seen, and are taken to be those of the others.
+        walking: sensors whose zeros wander.
+        fastest: how far such a zero goes at most, over the size of its noise, per square root of time.
     """
 
     times: Float[ndarray, " rows"]
@@ -54,6 +60,8 @@ class Rows:
     sensor: Int[ndarray, " channels"]
     least: float = 0.0
     curved: frozenset[int] = frozenset()
+    walking: frozenset[int] = frozenset()
+    fastest: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -89,6 +97,8 @@ class Noise:
         tail: degrees of freedom of Student's t, more than 2; infinite for a Gaussian.
         memory: correlation time (sensors,), in units of time; 0 for white noise.
         structure: which of these were fitted.
+        walk: standard deviation of the walk of each zero after a unit of time (sensors,), in units of the readings;
+            empty where no zero wanders.
     """
 
     size: Float[ndarray, " sensors"]
@@ -96,6 +106,7 @@ class Noise:
     tail: float
     memory: Float[ndarray, " sensors"]
     structure: Structure
+    walk: Float[ndarray, " sensors"] = field(default_factory=lambda: np.zeros(0))
 
     @property
     def parameters(self) -> int:
@@ -127,7 +138,28 @@ class Noise:
         spread = np.sqrt(1 - rho**2)
         before = np.zeros_like(rho)
         before[1:] = rho[1:] / (spread[1:] * size[:-1])
-        return Whitener(chain, seen, 1 / (size * spread), before, self.tail, float(np.sum(np.log(size * spread))))
+        own, log_scale = 1 / (size * spread), np.log(size * spread)
+        if not np.any(self.walk):
+            return Whitener(chain, seen, own, before, self.tail, float(np.sum(log_scale)))
+        where = np.flatnonzero(self.walk[chain.sensor] > 0)
+        linked = np.isfinite(chain.gap[where])
+        time = np.where(linked, chain.gap[where], chain.time[where] - np.min(rows.times))
+        walk = Walk.of(where, size[where], self.walk[chain.sensor[where]], time, linked)
+        own[where], before[where], log_scale[where] = 1.0, linked, 0.0
+        return Whitener(chain, seen, own, before, self.tail, float(np.sum(log_scale)) + walk.log_scale, walk)
+
+    def still(self, left: Readings, level: Readings, rows: Rows) -> Readings:
+        """Return residuals without the walks of zeros, as far as these can be told from the rest of the noise.
+
+        It is what is expected of the white part, s_k^2 times the inverse covariance of the noise times x.
+        """
+        if not np.any(self.walk):
+            return left
+        seen = np.isfinite(left)
+        whitener = self.whitener(level, rows, seen)
+        white = whitener.transposed(whitener.apply(np.where(seen, left, 0.0)))
+        variance = self.size[rows.sensor] ** 2 + (self.growth * level) ** 2
+        return np.where(self.walk[rows.sensor] > 0, np.where(seen, variance * white, np.nan), left)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,13 +167,15 @@ class Whitener:
     """A linear map from residuals to innovations in units of their size.
 
     z_k = (x_k / s_k - rho_k x_p / s_p) / sqrt(1 - rho_k^2), where p is the last reading that was seen of the same
-    channel in the same piece; x / s at the first of a piece.
+    channel in the same piece; x / s at the first of a piece. Where a zero wanders these are differences x_k - x_p, and
+    `walk` makes innovations of them.
 
     Attributes:
         seen: where there are readings (rows, channels).
         own, before: factors of each reading of the chain and of the one before it, 0 where there is none.
         tail: degrees of freedom of Student's t.
         log_scale: sum of the logarithms of the innovations' sizes s_k sqrt(1 - rho_k^2).
+        walk: what makes innovations of the differences of readings whose zeros wander.
     """
 
     chain: Chained
@@ -150,6 +184,7 @@ class Whitener:
     before: Float[ndarray, " readings"]
     tail: float
     log_scale: float
+    walk: Walk | None = None
 
     def apply(self, x: Float[ndarray, "rows channels *more"]) -> Float[ndarray, "rows channels *more"]:
         """Return the innovations of residuals or of their derivatives (any further axes), 0 where nothing was seen."""
@@ -159,6 +194,8 @@ class Whitener:
         z = values * self.own[:, None]
         if np.any(self.before):
             z[1:] -= values[:-1] * self.before[1:, None]
+        if self.walk is not None:
+            z[self.walk.where] = self.walk.apply(z[self.walk.where])
         found = np.zeros(whole.shape)
         found[self.chain.where] = z
         return np.swapaxes(found.reshape(*self.seen.T.shape, *along), 0, 1)
@@ -168,6 +205,8 @@ class Whitener:
         along = z.shape[2:]
         whole = np.swapaxes(z, 0, 1).reshape(self.seen.size, -1)
         values = whole[self.chain.where]
+        if self.walk is not None:
+            values[self.walk.where] = self.walk.transposed(values[self.walk.where])
         x = values * self.own[:, None]
         if np.any(self.before):
             x[:-1] -= values[1:] * self.before[1:, None]
@@ -187,7 +226,7 @@ class Whitener:
 
 @dataclass(frozen=True, eq=False)
 class Chained:
-    """The readings that were seen, channel after channel: their places in a flat array (channels, rows) and sensors.
+    """The readings that were seen, channel after channel: places in a flat array (channels, rows), sensors and times.
 
     `gap` is the time since the reading before, at least `CLOSE` of the typical one; infinite where there is none in the
     same channel and piece.
@@ -196,6 +235,7 @@ class Chained:
     where: Int[ndarray, " readings"]
     sensor: Int[ndarray, " readings"]
     gap: Float[ndarray, " readings"]
+    time: Float[ndarray, " readings"]
 
     def of(self, values: Shaped[ndarray, "rows channels"]) -> Shaped[ndarray, " readings"]:
         """Return the values of the readings in this order."""
@@ -211,7 +251,8 @@ def chained(rows: Rows, seen: Seen) -> Chained:
     gap = np.full(len(where), np.inf)
     gap[1:] = np.where(linked, np.diff(rows.times[row]), np.inf)
     apart = gap[np.isfinite(gap) & (gap > 0)]
-    return Chained(where, rows.sensor[channel], np.maximum(gap, CLOSE * np.median(apart)) if len(apart) else gap)
+    apart_enough = np.maximum(gap, CLOSE * np.median(apart)) if len(apart) else gap
+    return Chained(where, rows.sensor[channel], apart_enough, rows.times[row])
 
 
 def minus_log_density(z: Float[ndarray, " readings"], tail: float) -> float:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.noise import CLOSEST, Noise, Rows, Structure, chained, minus_log_density
+from latticebench.diagnosis.walk_estimate import walked
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -56,8 +57,12 @@ def estimate(
         start: where to start, such as the noise at the last step of an iteration.
     """
     task = _Task.of(left, level, rows)
-    curved = np.isin(rows.sensor, list(rows.curved))
-    plain = np.where(curved, np.nan, left) if np.any(curved) and np.any(np.isfinite(left[:, ~curved])) else left
+    apart = np.isin(rows.sensor, list(rows.curved | rows.walking))
+    others = bool(np.any(np.isfinite(left[:, ~apart])))
+    plain = np.where(apart, np.nan, left) if np.any(apart) and others else left
+    if structure is not None and not others:
+        # Where all zeros wander, growth and tails are not told from the walks.
+        structure = replace(structure, growth=False, tails=False)
     if structure is None:
         start = _chosen(_Task.of(*_glance(plain, level, rows)))
         structure = start.structure
@@ -65,13 +70,15 @@ def estimate(
         found = task.best(structure, start)[0]
     else:
         found = task.lent(_Task.of(plain, level, rows).best(structure, start)[0], rows.curved)
+    if rows.walking:
+        found = walked(found, left, level, rows, start)
     everything, taken = len(task.value), float(np.sum(free))
     scale = float(np.sqrt(everything / max(everything - taken, 1.0))) if everything else 1.0
     own = np.full(task.sensors, scale)
     if np.ndim(free) and found.structure.own_sizes:
         count = np.bincount(task.sensor, minlength=task.sensors)
         own = np.sqrt(np.maximum(count, 1) / np.maximum(count - free, SPARE * np.maximum(count, 1)))
-    return replace(found, size=found.size * own, growth=found.growth * scale)
+    return replace(found, size=found.size * own, growth=found.growth * scale, walk=found.walk * own[: len(found.walk)])
 
 
 def _glance(left: ndarray, level: ndarray, rows: Rows) -> tuple[ndarray, ndarray, Rows]:

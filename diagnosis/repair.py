@@ -286,7 +286,7 @@ def _diagnosis(
         before, after, named, _verdict(named, left, found.whole), found.whole, found.horizons, left, problem.data,
         (sum(len(one.t) for one in problem.data), recorded), noise, _noise_lines(problem, after),
         residual=both(lambda one: _over(one, noise)),
-        rms=both(lambda one: float(np.sqrt(np.nanmean(one.followed.left**2)))),
+        rms=both(lambda one: float(np.sqrt(np.nanmean(one.left**2)))),
         dynamics=both(lambda one: _dynamics(problem, one)),
         forecasts=both(foreseen),
         criterion=(0.0, more * float(np.log(after.layout.readings())) - gain),
@@ -310,12 +310,13 @@ def _noise(problem: Problem, after: Fitted) -> Float[ndarray, " sensors"]:
 
 def _over(fitted: Fitted, noise: ndarray) -> float:
     """Return the RMS of what a fit leaves, in units of the noise."""
-    ratio = fitted.followed.left / noise[fitted.rows.sensor]
+    ratio = fitted.left / noise[fitted.rows.sensor]
     return float(np.sqrt(np.nanmean(ratio**2)))
 
 
 def _noise_lines(problem: Problem, after: Fitted) -> tuple[str, ...]:
-    return tuple(describe(after.noise, problem.steps, interval=problem.step, least=after.rows.least))
+    noise, span = after.noise, problem.scene.span
+    return tuple(describe(noise, problem.steps, interval=problem.step, least=after.rows.least, span=span))
 
 
 def _dynamics(problem: Problem, fitted: Fitted) -> float:

@@ -23,6 +23,9 @@ LINE, AROUND, APART, FEW_AROUND, CROWDED = 4, 24, 4.0, 8, 0.975
 # Stretches of the recordings whose numbers are compared: where they differ by more than the noise lets them, all
 # evidence is that much less. Twice as many can hold twice the evidence of what is no noise; a few periods must fit in.
 STRETCHES = 32
+# The zero of a sensor wanders more slowly than the sites swing: at the main frequency its power is at most so many
+# times that of the other noise. A faster one would follow whatever a wrong equation leaves.
+SLOWER = 10.0
 # Models that are carried to the next horizon.
 RIVALS = 3
 # Candidates of each model that are fitted in full, those of the highest score first.

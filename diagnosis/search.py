@@ -30,6 +30,7 @@ from latticebench.diagnosis.progress import Found, Horizon, Tried
 from latticebench.diagnosis.regression import regressed, sustained
 from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
+from latticebench.diagnosis.walk_estimate import won_by_walking
 from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, same, wald
 
 Watcher = Callable[[str], None]
@@ -94,8 +95,9 @@ class Search:
             whole = length >= self._longest
             waves = length * self.problem.step * self.problem.main / (2 * np.pi)
             strays = last is not None and misfits(self.problem, last.models[0], anywhere=True)
-            late = whole or stuck or waves >= rules.PERIODS or strays
-            self.open = tuple(one for one in self.problem.candidates if late or not one.timed)
+            long = whole or waves >= rules.PERIODS
+            late = long or stuck or strays
+            self.open = tuple(one for one in self.problem.candidates if (long if one.slow else late or not one.timed))
             before, fits = carried[0], list(carried[1:])
             if late and not opened:
                 begun = (self._begun(one, self.problem, fits[0].layout) for one in sustained(self.problem))
@@ -395,8 +397,19 @@ class Search:
         """Return the fit without one effect; None where it comes to no cost below `hope`."""
         return self.refit(fitted.model.without(number), fitted.layout, fitted.followed.nodes, fitted, CHANGED, hope)
 
+    def restless(self, fitted: Fitted) -> list[Scored]:
+        """Return what zeros that wander would win, by what is left at their sensors."""
+        every = {site: one for one in self.open if (site := one.wandering()) is not None}
+        absent = {site: one for site, one in every.items() if site not in fitted.rows.walking}
+        followed = fitted.followed
+        gains = won_by_walking(fitted.noise, followed.left, followed.swing, fitted.rows, absent)
+        return [Scored(one, float(gain), 1, 2 * float(gain)) for one, gain in zip(absent.values(), gains, strict=True)]
+
     def with_effect(self, fitted: Fitted, placed: Placed) -> Fitted | None:
         """Return the fit with one effect more, from its score's numbers or, where these lead astray, from a tenth."""
+        if placed.wandering() is not None:
+            model = fitted.model.with_effect(placed)
+            return self.refit(model, fitted.layout, fitted.followed.nodes, fitted, CHANGED, fitted.cost)
         numbers = placed.numbers
         weaker = numbers.copy()
         weaker[: len(placed.strength)] *= 0.1
@@ -459,11 +472,11 @@ class Search:
         tangent, own = self.tangent(fitted), Worth(self.problem, fitted)
         if timed:
             past = past_of(self.problem, fitted.layout, fitted.model, fitted.followed.nodes)
-            courses = [one.with_past(past) for one in self.open if one.timed]
+            courses = [one.with_past(past) for one in self.open if one.timed and one.wandering() is None]
             absent += most_promising(tangent, courses, self.problem.price_of, lambda one: one.effect.name)
         best: dict[tuple[object, ...], tuple[float, Scored]] = {}
         tried: dict[str, Tried] = {}
-        for one in tangent.scored(absent):
+        for one in (*tangent.scored(absent), *(self.restless(fitted) if timed else ())):
             name = one.placed.effect.name
             price = self.problem.price(name, one.freedom)
             if name not in tried or one.gain - price > tried[name].gain - tried[name].price:

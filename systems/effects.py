@@ -30,6 +30,7 @@ HOW: dict[str, str] = {
     "ends": "the chain ends in another way than declared",
     "offset": "the reading is u + b; at one site, which is found, or with a b for every site",
     "drift": "the reading is u + d (t - t_0) / T, T being the recording's length; at one site, which is found",
+    "wander": "the reading is u + w(t), w wandering at random, more slowly than the sites swing; at one site, found",
     "gain": "the reading is g u; at one site, which is found, or with a g for every site",
     "curve": "the reading is u + c u^2",
     "clock": "the recorded times are wrong by a share of themselves",
@@ -262,6 +263,10 @@ CATALOGUE: tuple[Effect, ...] = (
     # The instrument.
     Effect("sensor-offset", "1", acts="offset", look_for="a residual that does not change in time", source=LJUNG),
     Effect("sensor-drift", "1", acts="drift", look_for="one sensor's residual that changes slowly", source=LJUNG),
+    Effect(
+        "sensor-wander", "1", acts="wander", look_for="one sensor's residual that goes its own slow way",
+        source="Durbin & Koopman, Time Series Analysis by State Space Methods (2012), section 2.2",
+    ),
     Effect("sensor-gain", "u[n]", acts="gain", look_for="a residual in proportion to one site's reading", source=LJUNG),
     Effect(
         "sensor-curve", "u[n]**2", complex_field="abs(u[n])*u[n]", acts="curve",

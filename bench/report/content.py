@@ -270,7 +270,8 @@ def _noise_lines(diagnosis: Diagnosis, units: Units) -> tuple[str, ...]:
     noise, interval = diagnosis.after.noise, float(np.median(np.diff(first.t)))
     fields = [first.u] if len(noise.size) == first.sites or first.v is None else [first.u, first.v]
     steps = [step_of(split_parts(one[:, k], first.is_complex).ravel()) for one in fields for k in range(first.sites)]
-    return tuple(noise_in_words(noise, steps, interval, first.sites, units))
+    span = max(float(one.t[-1] - one.t[0]) for one in diagnosis.data)
+    return tuple(noise_in_words(noise, steps, interval, first.sites, units, span))
 
 
 def _equation(fitted: Fitted, chain: Chain, units: Units) -> Equation:

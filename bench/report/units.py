@@ -77,18 +77,24 @@ def of_natural(name: str, units: Units) -> tuple[float, str]:
     """Return the factor and the unit of an effect's number in its natural form, by its name."""
     if name.startswith(("offset of ", "drift of ")):
         return 1 / units.scale, units.reading
+    if name.startswith("walk of "):
+        # A standard deviation has no sign.
+        return 1 / abs(units.scale), units.reading
     return 1.0, units.time if name.endswith("time") else ""
 
 
 def in_sentence(line: str, units: Units) -> str:
     """Return a sentence about an effect with its offset or drift, or its time, in the units of the recording."""
-    zero = re.fullmatch(r"((?:offset|drift) of \w+): (\S+)(.*)", line)
+    zero = re.fullmatch(r"((?:offset|drift|walk) of \w+): (\S+)(.*)", line)
     if zero:
-        return f"{zero[1]}: {with_unit(f'{float(zero[2]) / units.scale:.{DIGITS}g}', units.reading)}{zero[3]}"
+        factor, unit = of_natural(zero[1], units)
+        return f"{zero[1]}: {with_unit(f'{float(zero[2]) * factor:.{DIGITS}g}', unit)}{zero[3]}"
     return with_unit(line, units.time) if re.search(r" within [\d.e+-]+$", line) else line
 
 
-def noise_in_words(noise: Noise, steps: Sequence[float], interval: float, sites: int, units: Units) -> list[str]:
+def noise_in_words(
+    noise: Noise, steps: Sequence[float], interval: float, sites: int, units: Units, span: float | None = None
+) -> list[str]:
     """Return the noise of each sensor in words, in the unit of its readings; see `diagnosis.instrument.describe`.
 
     Args:
@@ -97,13 +103,15 @@ def noise_in_words(noise: Noise, steps: Sequence[float], interval: float, sites:
         interval: time from one reading to the next.
         sites: sensors of u, after which those of v come.
         units: of the recording.
+        span: length of the recording, over which zeros wander.
     """
     lines: list[str] = []
     for begin in range(0, len(noise.size), sites):
         own = slice(begin, begin + sites)
-        part = replace(noise, size=noise.size[own] / abs(units.scale), memory=noise.memory[own])
+        size, walk = noise.size[own] / abs(units.scale), noise.walk[own] / abs(units.scale)
+        part = replace(noise, size=size, memory=noise.memory[own], walk=walk)
         unit = units.reading if begin == 0 else rate_of(units.reading, units.time)
         grid = [step / abs(units.scale) for step in steps[own]]
-        told = describe(part, grid, unit, interval=interval, time=units.time)
+        told = describe(part, grid, unit, interval=interval, time=units.time, span=span)
         lines += [("velocity, " if begin else "") + line for line in told]
     return lines

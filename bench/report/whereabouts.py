@@ -6,6 +6,7 @@ Residuals are in units of the noise, sites are counted from 1, frequencies are a
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -75,7 +76,8 @@ def _innovations(fitted: Fitted, diagnosis: Diagnosis) -> list[Trajectory]:
 
     Correlated noise is uncorrelated then, and outliers of heavy tails are brought in, so that the mean square is 1.
     """
-    noise = diagnosis.after.noise
+    # Curves follow the zeros that wander.
+    noise = replace(diagnosis.after.noise, walk=np.zeros(0))
     # Where readings show less noise than the model leaves, the rest is no noise; of correlated noise they show a part.
     unit = np.where(noise.memory > 0, 1.0, noise.deviation() / diagnosis.noise)
     return [(one.t, _whitened(one, noise, unit)) for one in fitted.curves()]

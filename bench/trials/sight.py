@@ -197,7 +197,9 @@ class Sight:
         scene = self._scene(chain, line)
         field = dynamics.whole(line.nodes, None)[:, :levels]
         every_place = (one for effect in CATALOGUE for one in way_of(effect).places(effect, scene))
-        placed = [one for one in every_place if len(one.strength) < chain.sites - 1]
+        # What a zero that wanders does cannot be foreseen.
+        foreseen = (one for one in every_place if one.wandering() is None)
+        placed = [one for one in foreseen if len(one.strength) < chain.sites - 1]
         pushing = []
         for one in placed:
             if one.instrument:

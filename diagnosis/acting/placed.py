@@ -171,6 +171,7 @@ class Placed(ABC):
         shape: names of the fields that a fit changes besides.
         instrument: whether it acts on readings, not on the motion.
         timed: whether it has a frequency or a time of its own; it can then stand in for much on short horizons.
+        slow: whether it is looked for on long horizons alone, whatever is seen on short ones.
         local: whether it acts at single sites, or at each differently.
         fed: whether it depends on the field at earlier times.
         separated_by: the measurement that tells this way of acting from others; nothing where none is known.
@@ -181,6 +182,7 @@ class Placed(ABC):
     shape: ClassVar[tuple[str, ...]] = ()
     instrument: ClassVar[bool] = False
     timed: ClassVar[bool] = False
+    slow: ClassVar[bool] = False
     local: ClassVar[bool] = False
     fed: ClassVar[bool] = False
     separated_by: ClassVar[str] = ""
@@ -277,6 +279,14 @@ class Placed(ABC):
     def other_ends(self) -> Ends | None:
         """Return how the chain ends instead of as declared; None where that does not change."""
         return None
+
+    def wandering(self) -> int | None:
+        """Return the site whose sensor has a zero that wanders; None where there is none."""
+        return None
+
+    def with_walks(self, walk: Float[ndarray, " sensors"]) -> Self:  # noqa: ARG002
+        """Return it with how far zeros wander, by the root of the time, where that is what it says."""
+        return self
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:
         """Return what the instrument makes of a field (rows, levels, parts, N)."""

@@ -43,7 +43,7 @@ NEVER, ALWAYS = 0.0, 1e9
 OFF: Mapping[str, Any] = {
     "FALSE_ALARM": 1.0, "FALSE_DOUBT": NEVER, "NAMED": NEVER, "STAND_IN": NEVER,
     "FEW_AROUND": ALWAYS, "CROWDED": 0.5, "STRETCHES": 1, "RIVALS": 1, "TRIED": 1, "UNDERSTATED": 1.0,
-    "MOST_EFFECTS": 100, "EQUAL": NEVER, "PERIODS": NEVER, "FIRST_HORIZON": 1e6, "MOVES": ALWAYS,
+    "MOST_EFFECTS": 100, "EQUAL": NEVER, "SLOWER": ALWAYS, "PERIODS": NEVER, "FIRST_HORIZON": 1e6, "MOVES": ALWAYS,
     "AT_ONCE": NEVER, "FASTER": rules.GROWTH, "ALMOST": 1.0, "BORDER": 1e6, "LOST": ALWAYS, "FOLLOWED": NEVER,
     "SHARE": NEVER, "SHARE_TIMED": NEVER, "REPELLING": NEVER, "WORSE": ALWAYS, "BEYOND_NOISE": NEVER,
 }  # fmt: skip
@@ -55,6 +55,7 @@ NOT_DOUBLED = {"ALMOST", "SHARE_TIMED"}
 KINDS_OF_RECORDINGS = {
     "missing": "laboratory recordings of one to three sites, something missing: every effect is named and no other",
     "nothing": "such recordings with nothing missing: nothing is named, and the verdict is not `unexplained`",
+    "wandering": "laboratory recordings of one to three sites, one of whose zeros drifts or wanders: as missing",
     "unnamed": "short recordings of 25 sites with an effect that has no name: the verdict says that something is left",
     "relaxing": "short recordings of a Ginzburg-Landau lattice of 25 sites, one effect missing: it alone is named",
     "measured": "measured recordings: the effects that are known to be there are named, and the forecast is not worse",
@@ -65,6 +66,7 @@ SEEDS = {
     "nothing": range(32000, 32040),
     "unnamed": (33001,),
     "relaxing": (34001, 34002),
+    "wandering": range(35000, 35018),
 }
 SITES = (1, 2, 3)
 # Of so many laboratory recordings in a row so many are kept: those that take least time.
@@ -106,6 +108,10 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
             if kind == "nothing":
                 case = Laboratory(seed=seed, sites=sites, instrument=KINDS[place % len(KINDS)], effects="none")
             found.append((kind, str(seed), case))
+    found += [
+        ("wandering", str(seed), Laboratory(seed=seed, sites=SITES[place % len(SITES)], instrument="drifting-zero"))
+        for place, seed in enumerate(SEEDS["wandering"])
+    ]
     for seed in SEEDS["unnamed"]:
         trials = [(name, Trial(system="phi4", effect=name, z=30.0, seed=seed)) for name in [*FIFTH_BLIND][::EVERY]]
         found += [("unnamed", f"{name} {seed}", trial) for name, trial in trials]
@@ -121,7 +127,7 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
 
 def judged(kind: str, name: str, result: Mapping[str, Any]) -> dict[str, Any]:
     """Return the verdict, what was named, and whether that is right."""
-    if kind in ("missing", "nothing"):
+    if kind in ("missing", "nothing", "wandering"):
         row = laboratory.table([result]).iloc[0]
         right = row["right"] and not (kind == "nothing" and row["verdict"] == "unexplained")
         return {"truth": row["truth"], "verdict": row["verdict"], "named": row["named"], "right": right}
@@ -191,7 +197,7 @@ def compute(jobs: int, folder: Path | None, only: Sequence[str]) -> pd.DataFrame
         have = set(zip(here["kind"], here["recording"], strict=True))
         asked = {(kind, name) for kind, name, _ in every} if rule == AS_IS else short(rows, every)
         if value in ("half", "double"):
-            asked = {(kind, name) for kind, name in asked if kind in ("missing", "nothing", "relaxing")}
+            asked = {(kind, name) for kind, name in asked if kind not in ("unnamed", "measured")}
         work = [one for one in every if one[0] in kinds and one[:2] in asked - have]
         with ProcessPoolExecutor(jobs) as pool:
             for one in as_completed([pool.submit(diagnosed, rule, value, changed, case, folder) for case in work]):

@@ -91,6 +91,24 @@ def test_a_zero_that_drifts_is_named_with_its_sensor_and_how_far_it_goes():
     assert found.residual[1] == pytest.approx(1, abs=0.1)
 
 
+def test_a_zero_that_wanders_is_named_with_its_sensor_and_how_far_it_goes_and_leaves_the_noise():
+    recording = made(NONE)
+    read, far = recording.samples, 6 * recording.noise[1]
+    steps = np.diff(read.t, prepend=read.t[0]) / (read.t[-1] - read.t[0])
+    walk = far * np.cumsum(np.random.default_rng(5).normal(size=len(steps)) * np.sqrt(steps))
+    found = diagnosed_as(recording, replace(read, u=read.u + np.outer(walk, [0.0, 1.0])))
+    (one,) = found.findings
+    assert (one.name, one.site, found.verdict) == ("sensor-wander", 1, "explained")
+    assert 0.7 * far < one.placed.walk < 1.4 * far
+    np.testing.assert_allclose(found.noise, recording.noise, rtol=0.2)
+    assert "a zero that wanders by" in found.noise_lines[1]
+    assert "a zero that wanders by" not in found.noise_lines[0]
+    # It is seen as a part of the readings that the model follows.
+    (curve,) = found.after.curves()
+    assert np.nanstd(curve.level[:, 0, 0, 1] - curve.field[:, 0, 0, 1] - walk) < recording.noise[1]
+    assert found.forecast[1] <= found.forecast[0]
+
+
 @pytest.mark.parametrize("lab", [NONE, slow(SPIKES)], ids=str)
 def test_where_nothing_is_missing_nothing_is_named(lab):
     found = diagnosed(lab)

@@ -80,6 +80,7 @@ MISREADINGS = {
     "sensor-gain": _misread(instrument.gain),
     "sensor-curve": _misread(instrument.curve),
     "sensor-drift": _misread(instrument.drift),
+    "sensor-wander": _misread(instrument.wander),
     # Where only u is read, another unit of time does the same.
     "clock": replace(_misread(instrument.slow_clock), only="second order"),
 }

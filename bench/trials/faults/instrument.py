@@ -45,6 +45,12 @@ def drift(setting: Setting, size: float) -> Fields:
     return u + size * along[:, None] * setting.one, v
 
 
+def wander(setting: Setting, size: float) -> Fields:
+    """Let the zero of one sensor of u wander at random, by small steps."""
+    u, v = setting.run()
+    return u + size * setting.drawn.wander[:, None] * setting.one, v
+
+
 def slow_clock(setting: Setting, size: float) -> Fields:
     """Read each row late by a share of the time since the first."""
     begin = setting.times[0]

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Effects of which one may be found at several sensors.
 ONE_FOR_ALL = ("sensor-offset", "sensor-gain")
 # What an instrument of a kind does by itself: a finding says so, or the noise model holds it.
-OF_INSTRUMENT = {"drifting-zero": "sensor-drift"}
+OF_INSTRUMENT = {"drifting-zero": ("sensor-drift", "sensor-wander")}
 # The power of the unit of u by which the parameters of effects grow, where it is not 0.
 POWERS = {
     "onsite-quadratic": -1, "onsite-cubic": -2, "onsite-quintic": -4, "quadratic-coupling": -1,
@@ -162,7 +162,7 @@ def judge(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], instrume
         found: by the diagnosis.
         instrument: its kind; what that does by itself is not invented, and need not be found.
     """
-    found = [one for one in found if one.name != OF_INSTRUMENT.get(instrument)]
+    found = [one for one in found if one.name not in OF_INSTRUMENT.get(instrument, ())]
     pairs = matched(truth, found)
     named = tuple(one["name"] for one, j in zip(truth, pairs, strict=True) if j is not None)
     missed = tuple(one["name"] for one, j in zip(truth, pairs, strict=True) if j is None)

@@ -60,6 +60,7 @@ def test_each_effect_needs_a_finding_of_its_own() -> None:
 
 def test_what_an_instrument_does_by_itself_is_neither_missed_nor_invented() -> None:
     assert judge([], [said("sensor-drift", 0)], "drifting-zero").right
+    assert judge([], [said("sensor-wander", 0)], "drifting-zero").right
     assert judge([], [], "drifting-zero").right
     assert judge([], [said("sensor-drift", 0)], "white").invented == ("sensor-drift",)
     assert judge([], [said("sensor-offset", 0)], "drifting-zero").invented == ("sensor-offset",)

@@ -61,6 +61,17 @@ def test_the_zero_of_one_sensor_drifts_steadily(name):
 
 
 @pytest.mark.parametrize("name", BOTH)
+def test_the_zero_of_one_sensor_wanders_in_steps_that_know_nothing_of_one_another(name):
+    shown, true, one = lied(name, "sensor-wander")
+    site = int(one.about["site"])
+    walk = np.real(shown - true)
+    assert np.max(np.abs(np.delete(walk, site, axis=1))) == 0
+    steps = np.diff(walk[:, site])
+    assert np.std(steps) > 0
+    assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 4 / np.sqrt(len(steps))
+
+
+@pytest.mark.parametrize("name", BOTH)
 def test_a_drifting_sensor_warms_up(name):
     shown, true, one = lied(name, "other: drifting-sensor")
     site, t = int(one.about["site"]), one.clean.t
