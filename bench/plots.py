@@ -125,10 +125,15 @@ def lines_of_sites(part: SubFigure, overlay: Overlay) -> None:
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.25)
     part_of_it = ", where the first curve is worst" if len(t) < len(overlay.t) else ""
-    every[-1].set_xlabel(axis("t", overlay.time_unit) + part_of_it)
+    every[-1].set_xlabel(axis("t", overlay.time_unit) + part_of_it + _of_all(sites, overlay))
     if overlay.curves:
         handles = every[0].get_legend_handles_labels()
         part.legend(*handles, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
+
+
+def _of_all(sites: Sequence[int], overlay: Overlay) -> str:
+    """Say how many of the sites are drawn where not all are."""
+    return f" ({len(sites)} of {overlay.sites} sites)" if len(sites) < overlay.sites else ""
 
 
 def _range(fields: Sequence[ndarray]) -> tuple[float, float]:
@@ -226,7 +231,7 @@ def portraits(part: SubFigure, overlay: Overlay) -> None:
         axes.grid(alpha=0.25)
     for axes in list(every.flat)[len(sites) :]:
         axes.set_visible(False)
-    part.supxlabel(axis("Re u" if rates is None else "u", overlay.unit), fontsize=9)
+    part.supxlabel(axis("Re u" if rates is None else "u", overlay.unit) + _of_all(sites, overlay), fontsize=9)
     if rates is None:
         name = axis("Im u", overlay.unit)
     else:

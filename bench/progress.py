@@ -103,8 +103,8 @@ def wrong(case: Case, result: Mapping[str, Any]) -> str:
 
 
 def clock(seconds: float) -> str:
-    """Write a time as hours, minutes and seconds."""
-    return str(datetime.timedelta(seconds=round(seconds)))
+    """Write a time as hours, minutes and seconds, as a second at least where it is not 0."""
+    return str(datetime.timedelta(seconds=max(round(seconds), int(seconds > 0))))
 
 
 @contextmanager

@@ -30,6 +30,8 @@ NAMES = {";": "semicolons", "\t": "tabs", " ": "spaces"}
 MOST_HEAD = 200
 # Characters of a cell; the longest number has some 25.
 MOST_IN_A_CELL = 10_000
+# What tables have in the place of a value that is missing.
+DASHES = ("-", "--", "---", "\N{EN DASH}", "\N{EM DASH}")
 NUMBER = re.compile(r"\s*[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?\s*|\s*nan\s*", re.IGNORECASE)
 COMMA = r"\s*[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?\s*"
 
@@ -319,4 +321,7 @@ def _with_header(raw: pandas.DataFrame, path: Path, notes: tuple[str, ...]) -> T
         if any(second) and all(not cell or is_unit(cell) for cell in second) and not any(map(NUMBER.fullmatch, second)):
             units = {name: cell for name, cell in zip(header, second, strict=True) if cell}
             body = body.iloc[1:].reset_index(drop=True)
+    dashes = body.isin(DASHES)
+    if count := int(dashes.to_numpy().sum()):
+        body, notes = body.mask(dashes), (*notes, f"{count} cell(s) with a dash are taken as missing")
     return Table(body, units, notes)

@@ -38,6 +38,11 @@ class OtherEnds(Placed, acts="ends"):
         """The effect and the ends."""
         return (self.effect.name, self.way)
 
+    @property
+    def from_the_start(self) -> bool:
+        """Whether it is: of a motion at the ends, wrong ones make another coupling."""
+        return True
+
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return nothing: no number belongs to it."""
         return ()

@@ -101,6 +101,14 @@ def test_every_panel_is_drawn_of_any_chain_with_gaps_and_uneven_times(sites: int
         assert sum(part.get_visible() for part in figure.get_axes()) >= len(panels(overlay))
 
 
+@pytest.mark.parametrize("panel", ["sites", "phase"])
+def test_where_not_all_sites_are_drawn_the_picture_says_how_many(panel: str) -> None:
+    t = np.arange(30) * 0.2
+    for sites in (6, 7):
+        shown = words_of(plot(of_recording(Samples(t, np.cos(t)[:, None] * np.arange(1.0, sites + 1))), [panel]))
+        assert any("(6 of 7 sites)" in text for text in shown) == (sites == 7)
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-200, 1e49])
 def test_readings_of_any_size_are_drawn_without_a_warning(size: float, run: Run, tmp_path: Path) -> None:
     t = np.arange(30) * 0.2

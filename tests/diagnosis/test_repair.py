@@ -18,6 +18,7 @@ from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
+from latticebench.systems.simulate import observe, simulate
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,19 @@ def test_a_zero_that_wanders_is_named_with_its_sensor_and_how_far_it_goes_and_le
     (curve,) = found.after.curves()
     assert np.nanstd(curve.level[:, 0, 0, 1] - curve.field[:, 0, 0, 1] - walk) < recording.noise[1]
     assert found.forecast[1] <= found.forecast[0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_ends_that_are_declared_wrongly_are_named_alone_where_a_kink_stands_between_them(noise):
+    system = find("sine-gordon")
+    clean = simulate(system, sites=21, times=np.arange(50) * 0.2)
+    read = observe(clean, np.random.default_rng(1), noise=noise).observed()
+    declared = library("declared", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])")
+    found = diagnose(declared, 2, [replace(read, ends="fixed")], CATALOGUE)
+    (one,) = found.findings
+    assert (one.name, one.placed.settings(), found.verdict) == ("ends", {"ends": "free"}, "explained")
+    np.testing.assert_allclose(found.declared[1], [0.5, -1.0], rtol=1e-6 if noise == 0 else 0.1)
+    assert found.forecast[1] < found.forecast[0]
 
 
 @pytest.mark.parametrize("lab", [NONE, slow(SPIKES)], ids=str)

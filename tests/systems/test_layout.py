@@ -47,6 +47,15 @@ def test_separators_decimal_commas_and_byte_order_marks_change_nothing(tmp_path,
     assert ("decimals are written with commas" in one.origin.notes) == (decimal == ",")
 
 
+@pytest.mark.parametrize("dash", ["-", "--", "\N{EN DASH}"])
+def test_cells_with_a_dash_are_missing_and_counted(tmp_path, dash):
+    path = tmp_path / "a.csv"
+    path.write_text(f"t;u1;u2\n0;1,5;2\n1;{dash};2,5\n2;-1,25; {dash}\n3;1;2\n", encoding="utf-8")
+    (one,) = read(path, "free", Layout())
+    np.testing.assert_array_equal(one.u, [[1.5, 2], [np.nan, 2.5], [-1.25, np.nan], [1, 2]])
+    assert {"2 cell(s) with a dash are taken as missing", "decimals are written with commas"} <= {*one.origin.notes}
+
+
 def test_rows_above_the_table_are_skipped_and_counted(tmp_path):
     above = "Torsion chain, run 3\nOperator: R. M., t = 20 C\n# a remark\n\n"
     one = assert_pendula(written(tmp_path, lines(";", ",", above=above)))
