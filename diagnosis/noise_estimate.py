@@ -60,7 +60,7 @@ def estimate(
     apart = np.isin(rows.sensor, list(rows.curved | rows.walking))
     others = bool(np.any(np.isfinite(left[:, ~apart])))
     plain = np.where(apart, np.nan, left) if np.any(apart) and others else left
-    if structure is not None and not others:
+    if structure is not None and rows.walking and not others:
         # Where all zeros wander, growth and tails are not told from the walks.
         structure = replace(structure, growth=False, tails=False)
     if structure is None:

@@ -105,6 +105,21 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     assert f"{exact.split(' (')[0]} of {exact.split()[-1]} laboratory recordings" in readme
 
 
+def test_the_page_on_the_diagnosis_says_what_the_second_look_at_held_out_instruments_found() -> None:
+    frame = pd.read_csv(RESULTS / "loop" / "second-look" / "laboratory.csv", comment="#")
+    alarms = nothing_missing(frame).set_index("instrument")["false alarms"]
+    for instrument, told in (
+        ("jittered-gaps", "jittered times and missing stretches"),
+        ("drifting-zero", "a zero that drifts, up to five effects besides"),
+    ):
+        right = frame.loc[(frame["instrument"] == instrument) & (frame["count"] > 0), "right"]
+        rows = (
+            f"| {told} | every effect named, and no other | {share(shares(right.astype(bool)))} | "
+            f"| | nothing missing: an effect named | {share(alarms[instrument])} |"
+        )
+        assert rows in words("diagnosis"), instrument
+
+
 def test_the_page_on_the_diagnosis_says_what_the_tables_of_short_recordings_say() -> None:
     loop, pairs = (pd.read_csv(RESULTS / name / "trials.csv", comment="#") for name in ("loop", "loop/pairs"))
     loop, pairs = (frame[frame["status"] == "ok"] for frame in (loop, pairs))
