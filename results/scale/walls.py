@@ -42,7 +42,7 @@ from latticebench.systems.files import write_text
 HERE = Path(__file__).parent
 # Trivial cases, and how often they are run: for the seconds of the cases, and of the whole. Before so many, processes
 # still import what they need.
-TRIVIAL, TIMES, FEW = 10_000, 10, 3
+TRIVIAL, TIMES, FEW = 10_000, 8, 1
 SETTLED = 100
 SUITE = f"""title = "trivial cases"
 [methods.zero]
