@@ -9,9 +9,9 @@ walls.md; rows of the other are kept.
 no limits of time or memory. In the suite `default` both begin at the same moment, each on a core of its own, so that
 what else the machine does slows both, and seconds are those of `latticebench run` from its start to its end. Trivial
 cases are run with and without in turns, either one first every second time, since the process that keeps their results
-needs a part of another core; there seconds are those from the end of the hundredth case to that of the last. `whole` is
-how much longer `latticebench run` takes from its start to its end: it starts two processes, reads the suite, and prints
-a table of all cases.
+needs a part of another core; there seconds are those from the end of the hundredth case to that of the last. `trivial,
+whole` is how much longer `latticebench run` takes from its start to its end: it starts two processes, reads the suite,
+and prints a table of all cases.
 """
 
 from __future__ import annotations
