@@ -27,7 +27,7 @@ from latticebench.systems.layout import UNITS, Layout, choose, quoted
 from latticebench.systems.ordering import averaged, in_order, unwrapped
 from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
-from latticebench.systems.tables import Table, check_count, named_once, read_csv, read_sheet
+from latticebench.systems.tables import DASHES, Table, check_count, named_once, read_csv, read_sheet
 
 if TYPE_CHECKING:
     import pandas
@@ -243,6 +243,11 @@ def _from_table(table: Table, source: str, ends: Ends, layout: Layout) -> list[S
     if len(table.body) == 0:
         raise InputError(f"{source}: it has 0 row(s) of data; a motion needs at least 2")
     body, origin = table.body, replace(choice.origin, notes=(*table.notes, *choice.origin.notes))
+    read = list(dict.fromkeys(old for new, old in choice.names.items() if new != "trajectory"))
+    dashes = body[read].isin(DASHES)
+    if count := int(dashes.to_numpy().sum()):
+        body = body.assign(**body[read].mask(dashes))
+        origin = origin.noting(f"{count} cell(s) with a dash are taken as missing")
     body, said = _with_seconds(body, choice.names["t"], source)
     if said and layout.time_factor != 1:
         raise InputError(f"{source}: --time-scale {layout.time_scale}: dates become seconds already; leave it out")

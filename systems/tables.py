@@ -318,10 +318,11 @@ def _with_header(raw: pandas.DataFrame, path: Path, notes: tuple[str, ...]) -> T
     units: dict[str, str] = {}
     if len(body):
         second = ["" if pd.isna(cell) else str(cell).strip() for cell in body.iloc[0]]
-        if any(second) and all(not cell or is_unit(cell) for cell in second) and not any(map(NUMBER.fullmatch, second)):
-            units = {name: cell for name, cell in zip(header, second, strict=True) if cell}
+        units = {name: cell for name, cell in zip(header, second, strict=True) if is_unit(cell)}
+        # A column without a unit has nothing there, or a dash.
+        others = {cell for cell in second if not is_unit(cell)}
+        if units and others <= {"", *DASHES} and not any(map(NUMBER.fullmatch, second)):
             body = body.iloc[1:].reset_index(drop=True)
-    dashes = body.isin(DASHES)
-    if count := int(dashes.to_numpy().sum()):
-        body, notes = body.mask(dashes), (*notes, f"{count} cell(s) with a dash are taken as missing")
+        else:
+            units = {}
     return Table(body, units, notes)

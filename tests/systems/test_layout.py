@@ -56,6 +56,21 @@ def test_cells_with_a_dash_are_missing_and_counted(tmp_path, dash):
     assert {"2 cell(s) with a dash are taken as missing", "decimals are written with commas"} <= {*one.origin.notes}
 
 
+def test_dashes_in_columns_that_are_not_read_are_not_told_and_labels_stay(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t,u1,trajectory,note\n0,1,-,-\n1,2,-,-\n0,3,b,-\n1,4,b,-\n", encoding="utf-8")
+    first, second = read(path, "free", Layout())
+    assert not any("dash" in note for one in (first, second) for note in one.origin.notes)
+    np.testing.assert_array_equal(np.concatenate([first.u, second.u])[:, 0], [1, 2, 3, 4])
+
+
+def test_a_row_of_units_may_have_a_dash_for_a_column_without_one(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t;u1;u2;count\ns;mm;mm;-\n0;1;2;5\n1;1;2;6\n2;2;1;7\n", encoding="utf-8")
+    (one,) = read(path, "free", Layout())
+    assert (one.origin.time, one.origin.unit, len(one.t)) == ("s", "mm", 3)
+
+
 def test_rows_above_the_table_are_skipped_and_counted(tmp_path):
     above = "Torsion chain, run 3\nOperator: R. M., t = 20 C\n# a remark\n\n"
     one = assert_pendula(written(tmp_path, lines(";", ",", above=above)))
