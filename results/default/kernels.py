@@ -132,8 +132,9 @@ def page() -> str:
         "Made by `python results/default/kernels.py`: a tenth of the cases of each method, drawn with a seed, fitted "
         f"again under the kernels {', '.join(KERNELS)} of OpenBLAS. change: of E2, as a share of the published one; "
         f"covered: fits whose E2 is the published one to {100 * SHOWN:g} %, is rounding (below {ROUNDING:g}), or lies "
-        "between the least and the largest of the published seeds. (Of fits with a new seed, two thirds would lie "
-        "there: six draws have two ends.) The kernel of the published run is left out of the first table.\n\n"
+        "between the least and the largest of the published seeds. (Of fits with a new seed beside n others, "
+        "(n - 1) / (n + 1) would lie there: of n + 1 draws two are the ends.) The kernel of the published run is left "
+        "out of the first table.\n\n"
         f"{markdown_table(compared(table))}\n\nE2 of each case:\n\n{markdown_table(table[columns])}\n\n{about}"
     )
 
