@@ -1,17 +1,16 @@
-"""Measure what limits, leases and the store cost a run: the same cases with them and without.
+"""Measure what limits, leases, a process of their own and keeping each at once cost the cases of a run.
 
     python results/scale/walls.py [default] [trivial]
 
 runs the suite `default` and 10 000 trivial cases (`zero`, which fits nothing), or one of both, and writes walls.csv and
 walls.md; rows of the other are kept.
 
-`with` is a run with one worker; `without` is one process that runs the cases one after another, keeps nothing and has
-no limits of time or memory. In the suite `default` both begin at the same moment, each on a core of its own, so that
-what else the machine does slows both, and seconds are those of `latticebench run` from its start to its end. Trivial
-cases are run with and without in turns, either one first every second time, since the process that keeps their results
-needs a part of another core; there seconds are those from the end of the hundredth case to that of the last. `trivial,
-whole` is how much longer `latticebench run` takes from its start to its end: it starts two processes, reads the suite,
-and prints a table of all cases.
+`with` is `latticebench run` with one worker. `without` does the same from its start to its end - it reads the suite,
+runs the cases, keeps their results and prints their table - but in one process, without leases or limits of time or
+memory, and keeps all results at once when the last case has ended. Seconds are those of the whole command. In the
+suite `default` both begin at the same moment, each on a core of its own, so that what else the machine does slows both.
+Trivial cases are run with and without in turns, either one first every second time, since the process that keeps their
+results needs a part of another core.
 """
 
 from __future__ import annotations
@@ -22,13 +21,15 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pandas as pd
 
-from latticebench.bench.case import Case
+from latticebench.bench.case import Case, Folders
+from latticebench.bench.executors.executor import Ledger
+from latticebench.bench.kinds import show
 from latticebench.bench.provenance import commit, lines, origin
 from latticebench.bench.publish import markdown_list, markdown_table, render
 from latticebench.bench.published import read_table
@@ -36,14 +37,13 @@ from latticebench.bench.run import run
 from latticebench.bench.store import create
 from latticebench.bench.suite import load
 from latticebench.bench.threads import ONE_THREAD
-from latticebench.bench.worker import attempt
+from latticebench.bench.worker import outcome
+from latticebench.methods.method import Skipped
 from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent
-# Trivial cases, and how often they are run: for the seconds of the cases, and of the whole. Before so many, processes
-# still import what they need.
-TRIVIAL, TIMES, FEW = 10_000, 8, 1
-SETTLED = 100
+# Trivial cases, and how often they are run.
+TRIVIAL, TIMES = 10_000, 8
 SUITE = f"""title = "trivial cases"
 [methods.zero]
 method = "zero"
@@ -56,54 +56,43 @@ seeds = "1-{TRIVIAL}"
 """
 
 
-def without(suite: str) -> None:
-    """Run all cases of a suite in this process; print the seconds from the hundredth to the last."""
-    cases, ends = load(suite), Ends()
-    for case in cases.by_identity.values():
-        ends.finished(case, attempt(case, cases.folders))
-    print(ends.seconds())
+def without(suite: str, results: str) -> None:
+    """Run a suite as `latticebench run` does, without what protects cases from one another and from interruptions."""
+    loaded, store = load(suite, large=True), create(Path(results))
+    run(loaded, store, executor=Bare(), about={"command": "python " + " ".join(sys.argv)})
+    show(store, loaded.title)
 
 
-def within(suite: str, results: str) -> None:
-    """Run the same by a worker, keeping each result; print the same."""
-    ends = Ends()
-    run(load(suite, large=True), create(Path(results)), jobs=1, watcher=ends)
-    print(ends.seconds())
+class Bare:
+    """An executor that runs cases one after another in this process, and keeps their results when all have ended."""
+
+    about: ClassVar[dict[str, Any]] = {"jobs": 0}
+
+    def execute(self, cases: Sequence[Case], folders: Folders, loads: Collection[str], ledger: Ledger) -> None:
+        """Run cases; see `Executor.execute`."""
+        made = origin(loads)
+        results = [self._attempt(case, folders) for case in cases]
+        with ledger.together():
+            for case, result in zip(cases, results, strict=True):
+                ledger.keep(case, result, made)
+
+    def _attempt(self, case: Case, folders: Folders) -> dict[str, Any]:
+        found = case.blank()
+        try:
+            case.run(folders, found)
+        except Skipped as skipped:
+            return outcome(case, "skipped", str(skipped), found)
+        return outcome(case, "ok", "", found)
 
 
-class Ends:
-    """A watcher that remembers when cases ended."""
-
-    def __init__(self) -> None:
-        self.times: list[float] = []
-
-    def count(self, left: int) -> None:
-        """Ignore how many there are."""
-
-    def started(self, case: Case) -> None:
-        """Ignore the start of a case."""
-
-    def found(self) -> None:
-        """Ignore what another run has done: there is none."""
-
-    def finished(self, case: Case, result: dict[str, Any]) -> None:  # noqa: ARG002
-        """Remember the time."""
-        self.times.append(time.perf_counter())
-
-    def seconds(self) -> float:
-        """Return the seconds from the hundredth case, or the first of fewer, to the last."""
-        return self.times[-1] - self.times[min(len(self.times), SETTLED) - 1]
-
-
-def started(suite: str, results: Path, *, walls: bool, whole: bool = True) -> subprocess.Popen[str]:
-    """Start a process that runs the cases of a suite, with walls or without; as `latticebench run` if whole."""
+def started(suite: str, results: Path, *, walls: bool) -> subprocess.Popen[str]:
+    """Start a process that runs the cases of a suite, with walls or without."""
     program = [sys.executable, "-m", "latticebench", "run", suite, "--jobs", "1", "--yes", "--results", str(results)]
-    own = [sys.executable, __file__, *(["--with", suite, str(results)] if walls else ["--without", suite])]
     # Workers of a run have one thread each.
-    alike = {**os.environ, **ONE_THREAD}
     return subprocess.Popen(
-        program if walls and whole else own, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=alike, text=True
-    )
+        program if walls else [sys.executable, __file__, "--without", suite, f"{results} bare"],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD}, text=True,
+    )  # fmt: skip
 
 
 def together(suite: str, results: Path) -> dict[bool, float]:
@@ -124,13 +113,13 @@ def together(suite: str, results: Path) -> dict[bool, float]:
     return took
 
 
-def alone(suite: str, results: Path, *, walls: bool, whole: bool = False) -> float:
-    """Return the seconds of one: from the hundredth case to the last, or from its start to its end."""
+def alone(suite: str, results: Path, *, walls: bool) -> float:
+    """Return the seconds of one, from its start to its end."""
     begin = time.perf_counter()
-    process = started(suite, results, walls=walls, whole=whole)
-    printed = process.communicate()[0]
+    process = started(suite, results, walls=walls)
+    process.communicate()
     check(process)
-    return time.perf_counter() - begin if whole else float(printed)
+    return time.perf_counter() - begin
 
 
 def check(process: subprocess.Popen[str]) -> None:
@@ -146,13 +135,9 @@ def pairs(part: str, kept: Path, folder: Path) -> Iterator[tuple[str, int, dict[
         return
     suite = folder / "trivial.toml"
     suite.write_text(SUITE)
-    for name, times in ((part, TIMES), ("trivial, whole", FEW)):
-        for number in range(times):
-            order = (True, False) if number % 2 else (False, True)
-            results = folder / f"{name} {number}"
-            yield name, TRIVIAL, {
-                walls: alone(str(suite), results, walls=walls, whole=name != part) for walls in order
-            }  # fmt: skip
+    for number in range(TIMES):
+        order = (True, False) if number % 2 else (False, True)
+        yield part, TRIVIAL, {walls: alone(str(suite), folder / str(number), walls=walls) for walls in order}
 
 
 def measured(part: str, kept: Path) -> Iterator[dict[str, object]]:
@@ -178,10 +163,7 @@ def told(rows: pd.DataFrame) -> str:
 def main() -> None:
     """Measure, and write the two files."""
     if sys.argv[1:2] == ["--without"]:
-        without(sys.argv[2])
-        return
-    if sys.argv[1:2] == ["--with"]:
-        within(*sys.argv[2:4])
+        without(*sys.argv[2:4])
         return
     parts, kept = sys.argv[1:] or ["default", "trivial"], Path("runs") / "walls"
     if "default" in parts and kept.exists():
