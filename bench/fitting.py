@@ -328,11 +328,10 @@ def _unseen_from(
 def _history(fit: Fit) -> dict[str, Any] | None:
     if fit.history is None:
         return None
-    records = len(fit.history.step)
-    kept = np.unique(np.linspace(0, records - 1, min(records, MAX_RECORDS)).round().astype(int))
+    kept = fit.history.thinned(MAX_RECORDS)
     return {
-        "step": fit.history.step[kept].astype(float).tolist(),
-        "seconds": np.round(fit.history.seconds[kept], 4).tolist(),
-        "loss": [plain(value) for value in fit.history.loss[kept]],
-        "coefficients": [[float(f"{value:.6g}") for value in row] for row in fit.history.coefficients[kept]],
+        "step": kept.step.astype(float).tolist(),
+        "seconds": np.round(kept.seconds, 4).tolist(),
+        "loss": [plain(value) for value in kept.loss],
+        "coefficients": [[float(f"{value:.6g}") for value in row] for row in kept.coefficients],
     }

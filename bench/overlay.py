@@ -23,14 +23,29 @@ if TYPE_CHECKING:
 
     from latticebench.diagnosis.repair import Diagnosis
     from latticebench.methods.engine.record import Record
-    from latticebench.methods.method import Fit
+    from latticebench.methods.method import Fit, History
 
 # Numbers of u that a picture shows of a recording with a fit, at most, and the fewest rows that it begins with.
 MOST_NUMBERS, FEWEST_ROWS = 20_000, 200
 # Steps in which the start of a motion is fitted, and how closely.
 STEPS, CLOSE = 20, 0.1
+# Records of a method's learning that a picture shows, at most.
+MOST_RECORDS = 300
 # Parts of an interval in which a motion is integrated that no start was found for.
 SUBSTEPS = 8
+
+
+@dataclass(frozen=True)
+class Learning:
+    """The coefficients of a method on the way to its fit.
+
+    Attributes:
+        terms: whose coefficients.
+        history: the way.
+    """
+
+    terms: tuple[str, ...]
+    history: History
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +62,7 @@ class Overlay:
             where it is not known.
         curves: what equations make of the readings, likewise, by name; NaN where nothing is known.
         unit, time_unit: of the readings and of the times; "" where they are not known.
+        learning: how the coefficients were found, of a method that iterates and has kept it.
     """
 
     source: str
@@ -58,6 +74,7 @@ class Overlay:
     curves: Mapping[str, Float[ndarray, "time parts sites"]] = field(default_factory=dict)
     unit: str = ""
     time_unit: str = ""
+    learning: Learning | None = None
 
     @property
     def sites(self) -> int:
@@ -116,7 +133,10 @@ def of_fit(data: Sequence[Samples], fit: Fit) -> Overlay:
     A method that follows a motion has it. Of any other the equation is taken as it was found, and its start, with what
     comes in at unknown ends, is fitted to the readings.
     """
-    found = [_beside(one, fit, number).read_as(one.origin) for number, one in enumerate(data)]
+    learning = None if fit.history is None else Learning(fit.library.texts, fit.history.thinned(MOST_RECORDS))
+    found = [
+        replace(_beside(one, fit, number).read_as(one.origin), learning=learning) for number, one in enumerate(data)
+    ]
 
     def left(one: Overlay) -> float:
         return float(np.nan_to_num(np.nanmean(one.residual(fit.method) ** 2), nan=np.inf))

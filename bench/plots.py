@@ -24,6 +24,8 @@ MAPPED = 4
 # Sites with a line or a portrait of their own, and the samples that a line of readings with a fit has at most.
 MOST_SITES, MOST_SAMPLES = 6, 240
 WIDTH, HEIGHT = 5.6, 3.6
+# Coefficients with a name beside their learning curves, and steps so few that each has a dot.
+MOST_TERMS, FEW_STEPS = 8, 40
 # Beyond so many times the range of the readings a curve has run away, and is not drawn.
 FAR = 5.0
 # A power below this counts as none.
@@ -63,6 +65,8 @@ def panels(overlay: Overlay) -> dict[str, Callable[[SubFigure, Overlay], None]]:
     every: dict[str, Callable[[SubFigure, Overlay], None]] = {"map": space_time, "sites": lines_of_sites}
     if overlay.curves:
         every["residual"] = residuals
+    if overlay.learning is not None:
+        every["learning"] = learning_curves
     return every | {"spectrum": spectra, "phase": portraits}
 
 
@@ -213,6 +217,34 @@ def in_decades(axes: Axes) -> bool:
     if found:
         axes.set_yscale("log")
     return found
+
+
+def learning_curves(part: SubFigure, overlay: Overlay) -> None:
+    """Draw the method's objective and the coefficients on the way to the fit, the largest of them with a name."""
+    assert overlay.learning is not None
+    terms, way = overlay.learning.terms, overlay.learning.history
+    above, below = part.subplots(2, 1, sharex=True, height_ratios=(1, 2))
+    above.plot(way.step, way.loss, color=INK, lw=1.2, marker="." if len(way.step) < FEW_STEPS else "")
+    in_decades(above)
+    above.set_ylabel("objective", fontsize=8)
+    last = way.coefficients[-1]
+    largest = np.argsort(-np.abs(last), kind="stable")
+    for term in largest[MOST_TERMS:]:
+        below.plot(way.step, way.coefficients[:, term], color=FAINT, lw=0.8)
+    # Neighbours in value, which may hide each other, differ in their dashes.
+    for place, term in enumerate(sorted(largest[:MOST_TERMS], key=lambda term: -last[term])):
+        below.plot(
+            way.step, way.coefficients[:, term], color=series(place), lw=1.6, ls=("-", (0, (3, 3)))[place % 2],
+            label=label(terms[term]),
+        )  # fmt: skip
+    low, high = _range([way.coefficients[-1], np.zeros(1)])
+    below.set_ylim(low - 0.4 * (high - low), high + 0.4 * (high - low))
+    below.set_ylabel("coefficient", fontsize=8)
+    below.set_xlabel("step")
+    for axes in (above, below):
+        axes.tick_params(labelsize=7)
+        axes.grid(alpha=0.25)
+    part.legend(*below.get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=7, frameon=False)
 
 
 def portraits(part: SubFigure, overlay: Overlay) -> None:

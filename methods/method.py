@@ -96,6 +96,12 @@ class History:
     loss: Float[ndarray, " record"]
     coefficients: Float[ndarray, "record terms"]
 
+    def thinned(self, most: int) -> History:
+        """Return at most so many of the records, evenly, with the first and the last."""
+        records = len(self.step)
+        kept = np.unique(np.linspace(0, records - 1, min(records, most)).round().astype(int))
+        return History(self.step[kept], self.seconds[kept], self.loss[kept], self.coefficients[kept])
+
 
 @dataclass(frozen=True, eq=False)
 class Smooth:

@@ -33,7 +33,7 @@ def plot(
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="Draw this panel alone: map, sites, residual, spectrum, phase; may be given several times."),
+        typer.Option(help="Draw this panel alone: map, sites, residual, learning, spectrum, phase; may be repeated."),
     ] = None,
     trajectory: Annotated[int, typer.Option(min=1, help="Which trajectory of a recording is drawn.")] = 1,
     time: Time = None,

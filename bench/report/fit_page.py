@@ -25,6 +25,7 @@ CAPTIONS = {
     "map": "The readings, site against time.",
     "sites": "Readings, and the motion of the equation that is nearest to them.",
     "residual": "What the equation leaves of the readings.",
+    "learning": "The method's objective and the coefficients on the way to the fit.",
     "spectrum": "The spectrum of what it leaves.",
     "phase": "The readings in their phase plane.",
 }

@@ -21,7 +21,7 @@ from latticebench.bench.overlay import Overlay, of_fit, of_recording
 from latticebench.bench.plots import panels, plot
 from latticebench.bench.report.fit_page import fit_page
 from latticebench.bench.report.shown import Shown
-from latticebench.methods.method import make, solve
+from latticebench.methods.method import History, make, solve
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Origin, Samples
@@ -87,6 +87,30 @@ def test_a_document_is_drawn_as_what_was_written(swings: Samples) -> None:
     again = Shown.model_validate_json(Shown.of(shown).model_dump_json()).overlay()
     np.testing.assert_allclose(again.seen, shown.seen, rtol=1e-5)
     np.testing.assert_allclose(again.curves["least-squares"], shown.curves["least-squares"], rtol=1e-5)
+
+
+def test_how_coefficients_were_learnt_is_drawn_of_methods_that_iterate(swings: Samples) -> None:
+    assert "learning" not in panels(fitted(swings, TERMS, "least-squares"))
+    shown = fitted(swings, TERMS, "pinn-gn")
+    again = Shown.model_validate_json(Shown.of(shown).model_dump_json()).overlay()
+    assert shown.learning is not None
+    assert again.learning is not None
+    assert again.learning.terms == shown.learning.terms
+    np.testing.assert_allclose(again.learning.history.coefficients, shown.learning.history.coefficients, rtol=1e-5)
+    objective, coefficients = plot(again, ["learning"]).get_axes()
+    lines = {str(line.get_label()): np.asarray(line.get_ydata()) for line in coefficients.get_lines()}
+    assert sorted(lines) == sorted(shown.learning.terms)
+    for term, last in zip(shown.learning.terms, shown.learning.history.coefficients[-1], strict=True):
+        assert lines[term][-1] == pytest.approx(last, rel=1e-5)
+    assert len(np.asarray(objective.get_lines()[0].get_ydata())) == len(shown.learning.history.step)
+
+
+def test_a_history_is_thinned_evenly_and_keeps_its_ends() -> None:
+    way = History(np.arange(100.0), np.arange(100.0), np.ones(100), np.arange(200.0).reshape(100, 2))
+    few = way.thinned(10)
+    assert few.step.tolist() == [0, 11, 22, 33, 44, 55, 66, 77, 88, 99]
+    np.testing.assert_array_equal(few.coefficients, way.coefficients[few.step.astype(int)])
+    assert len(way.thinned(1000).step) == 100
 
 
 @pytest.mark.parametrize(("sites", "kind"), [(1, float), (3, complex), (8, float)])
@@ -181,9 +205,11 @@ def test_a_fit_is_drawn_from_its_document_alone(run: Run, swings: Samples, tmp_p
     (tmp_path / "swings.csv").unlink()
     assert run("plot", "fit.json", "--out", "fit.png", "--only", "sites") == (0, "")
     old = json.loads((tmp_path / "fit.json").read_text())
+    way = {"terms": ["u[n]"], "step": [0], "seconds": [0], "loss": [0], "coefficients": [[0]]}
     for changed, reason in (
         ({**old, "shown": None}, "write it again"), ({**old, "schema": "latticebench/run/1"}, "no document of"),
         ({**old, "shown": {**old["shown"], "t": [0.0]}}, "do not match"), ([], "no document of"),
+        ({**old, "shown": {**old["shown"], "learning": {**way, "step": [0, 1]}}}, "steps, losses and coefficients"),
     ):  # fmt: skip
         (tmp_path / "other.json").write_text(json.dumps(changed))
         code, said = run("plot", "other.json", "--out", "other.png")
