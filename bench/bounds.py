@@ -11,7 +11,7 @@ import numpy as np
 from latticebench import methods
 from latticebench.bench.limit import Limit, bound_along, denser
 from latticebench.bench.noise import left_by
-from latticebench.bench.report.units import in_words, units_of
+from latticebench.bench.report.units import in_words, of_coefficients, units_of
 from latticebench.diagnosis.noise import Noise, Structure
 from latticebench.methods.method import solve
 from latticebench.systems.errors import InputError
@@ -36,11 +36,13 @@ class BoundOf:
         at: the bound.
         note: where it is taken, and the noise of each sensor, one line each.
         warnings: why it may not hold.
+        units: of the coefficients; empty where none is known.
     """
 
     at: BoundAt
     note: str
     warnings: tuple[str, ...]
+    units: tuple[str, ...] = ()
 
 
 def of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> BoundOf:
@@ -63,9 +65,10 @@ def of_recordings(data: Sequence[Samples], candidates: Library, order: int) -> B
         f"{data[0].source}: bound along the motion that {fit.method!r} fits to the samples, with the noise that it "
         "leaves" + ("" if fit.status == "ok" else f" ({fit.status})")
     )
-    units = in_words(units_of(data[0].origin))
-    lines = [note, *(f"noise of {line}" for line in left.lines), *([f"units: {units}"] if units else [])]
-    return BoundOf(bound_at, "\n".join(lines), left.warning)
+    units = units_of(data[0].origin)
+    told = in_words(units)
+    lines = [note, *(f"noise of {line}" for line in left.lines), *([f"units: {told}"] if told else [])]
+    return BoundOf(bound_at, "\n".join(lines), left.warning, tuple(of_coefficients(candidates.terms, order, units)))
 
 
 def covariance_of_fit(data: Sequence[Samples], fit: Fit) -> Float[ndarray, "terms terms"]:

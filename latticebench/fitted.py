@@ -16,6 +16,7 @@ from latticebench.bench.adequacy import Adequacy
 from latticebench.bench.overlay import Overlay, of_fit
 from latticebench.bench.report.mathematics import written
 from latticebench.bench.report.rows import html_table
+from latticebench.bench.report.units import of_coefficients, units_of
 from latticebench.exhibit import Exhibit
 from latticebench.methods.method import Fit, make
 from latticebench.pictures import Picture
@@ -130,10 +131,12 @@ class Fitted(Exhibit):
 
     @property
     def table(self) -> pd.DataFrame:
-        """The coefficients by term, with standard errors where the method gives them."""
+        """The coefficients by term, with standard errors and units where they are known."""
         columns: dict[str, Any] = {"coefficient": self.result.coefficients}
         if self.result.stderr is not None:
             columns["standard error"] = self.result.stderr
+        if own := of_coefficients(self.result.library.terms, self.result.order, units_of(self.data.samples[0].origin)):
+            columns["unit"] = own
         return pd.DataFrame(columns, index=self._terms)
 
     @property

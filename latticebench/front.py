@@ -170,6 +170,7 @@ class Bound:
         needed: what a smaller error needs.
         notes: where it is taken, and the noise of each sensor.
         warnings: why it may not hold.
+        units: of the coefficients; empty where none is known.
 
     Examples:
         >>> import latticebench as lb
@@ -189,12 +190,13 @@ class Bound:
     needed: Design
     notes: tuple[str, ...]
     warnings: tuple[str, ...] = field(default=())
+    units: tuple[str, ...] = field(default=())
 
     @property
     def table(self) -> pd.DataFrame:
-        """Each term's coefficient, smallest standard error and verdict."""
-        one = self.result
-        columns = {"coefficient": one.coefficients, "smallest error": one.stderr, "verdict": one.verdicts}
+        """Each term's coefficient, smallest standard error, unit where one is known, and verdict."""
+        one, unit = self.result, {"unit": self.units} if self.units else {}
+        columns = {"coefficient": one.coefficients, "smallest error": one.stderr, **unit, "verdict": one.verdicts}
         return pd.DataFrame(columns, index=pd.Index(one.library.texts, name="term"))
 
     def __repr__(self) -> str:
@@ -222,7 +224,8 @@ def limit(data: Recording, model: Model, target: float = 0.01) -> Bound:
     from latticebench.bench.limit import design
 
     found = calls.bound(Model.checked(model).of(data), model.library, model.order)
-    return Bound(found.at(1, 1), design(found.at, target=target), tuple(found.note.splitlines()), tuple(found.warnings))
+    needed = design(found.at, target=target)
+    return Bound(found.at(1, 1), needed, tuple(found.note.splitlines()), tuple(found.warnings), found.units)
 
 
 class Tables(dict[str, pd.DataFrame]):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -108,6 +109,11 @@ class Term:
         return -1 if _vanishes(flipped + self.expression) else None
 
     @property
+    def degrees(self) -> tuple[float, float, float] | None:
+        """The powers of u, v and f with which the term grows: (1, 2, 0) of u[n]*v[n]**2; None where it is no power."""
+        return _degrees(self.text)
+
+    @property
     def turns_with_phase(self) -> bool:
         """Whether u -> exp(i a) u (and v, f likewise) multiplies the term by exp(i a) for every real a."""
         import sympy
@@ -134,6 +140,30 @@ def _vanishes(expression: sympy.Expr) -> bool:
     if value.is_number and abs(complex(value)) > NOTHING:
         return False
     return bool(sympy.simplify(expression) == 0)
+
+
+@functools.lru_cache(maxsize=4096)
+def _degrees(text: str) -> tuple[float, float, float] | None:
+    expression = symbolic(text)
+    symbols = sorted(expression.free_symbols, key=lambda one: one.name)
+
+    def value(place: int, field: str = "", factor: float = 1.0) -> complex:
+        """Return the expression at one of several points, the values of one field times a factor."""
+        point = {one: 0.31 + 0.17 * ((3 * k + 2 * place) % 7) for k, one in enumerate(symbols)}
+        return complex(
+            expression.subs({one: at * (factor if one.name[0] == field else 1) for one, at in point.items()}).evalf()
+        )
+
+    powers = []
+    for field in FIELDS:
+        grown = [(value(place), value(place, field, factor), factor) for place in range(2) for factor in (2.0, 3.0)]
+        if any(before == 0 or (after / before).real <= 0 for before, after, _ in grown):
+            return None
+        found = [math.log((after / before).real, factor) for before, after, factor in grown]
+        if max(found) - min(found) > NOTHING:
+            return None
+        powers.append(round(found[0], 9) + 0.0)
+    return powers[0], powers[1], powers[2]
 
 
 @functools.lru_cache(maxsize=4096)

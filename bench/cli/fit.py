@@ -115,7 +115,7 @@ def _report(
     from latticebench.bench.report.fit_page import write_fit_page
     from latticebench.bench.report.outputs import fit_document
     from latticebench.bench.report.screen import show_fit
-    from latticebench.bench.report.units import in_words, units_of
+    from latticebench.bench.report.units import units_of
     from latticebench.systems.files import write_text
 
     units = units_of(data[0].origin)
@@ -130,10 +130,10 @@ def _report(
                 write_text(Path(json_out), text)
         if html_out is not None:
             with kept(failures):
-                write_fit_page(found, overlay, quality, about, html_out)
+                write_fit_page(found, overlay, quality, units, about, html_out)
     if json_out == "-":
         print(text, end="")
     else:
-        show_fit(found, quality, in_words(units))
+        show_fit(found, quality, units)
     if failures:
         raise InputError("; ".join(failures))

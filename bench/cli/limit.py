@@ -143,13 +143,13 @@ def _report(bound: BoundOf, target: float, json_out: str | None) -> None:
         from latticebench.bench.report.document import provenance, to_json
         from latticebench.bench.report.outputs import limit_document
 
-        text = to_json(limit_document(found, needed, bound.note, provenance([1]), bound.warnings))
+        text = to_json(limit_document(found, needed, bound, provenance([1])))
         if json_out != "-":
             with kept(failures):
                 write_text(Path(json_out), text)
     if json_out == "-":
         print(text, end="")
     else:
-        show_limit(found, needed, bound.note, bound.warnings)
+        show_limit(found, needed, bound.note, bound.warnings, bound.units)
     if failures:
         raise InputError("; ".join(failures))

@@ -18,7 +18,7 @@ from latticebench.bench.report.modes import Modes, modes
 from latticebench.bench.report.notes import notes
 from latticebench.bench.report.separation import Separation, separations
 from latticebench.bench.report.shown import Shown
-from latticebench.bench.report.units import Units, in_sentence, noise_in_words, units_of
+from latticebench.bench.report.units import Units, in_sentence, noise_in_words, of_coefficients, units_of
 from latticebench.bench.report.whereabouts import Whereabouts, whereabouts
 from latticebench.diagnosis.instrument import step_of, two_digits
 from latticebench.diagnosis.repair import NOT_FOLLOWED, NOT_REACHED, shortfalls
@@ -130,6 +130,7 @@ class Report(Content):
         horizons: how the search went.
         left: what is significant in the last residual.
         interrupted: whether the search was stopped; this is then what was known after the last of `horizons`.
+        declared_units: units of the declared coefficients; "" where one is not known, empty where none is.
     """
 
     verdict: Verdict
@@ -153,6 +154,7 @@ class Report(Content):
     notes: tuple[str, ...]
     interrupted: bool
     partly: tuple[str, ...] = ()
+    declared_units: dict[str, str] = {}
 
 
 class DiagnosisDocument(Report, Document):
@@ -174,6 +176,7 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
     after, after_errors = declared(diagnosis.after)
     units = units_of(diagnosis.data[0].origin)
     found, chain = added(diagnosis), diagnosis.after.chain
+    own = of_coefficients(diagnosis.after.model.declared.terms, chain.order, units)
     size = abs(units.scale)
     sensors = [f"{letter}{site + 1}" for letter in "uv"[: chain.levels] for site in range(chain.sites)]
     return Report(
@@ -195,6 +198,7 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
             for one in diagnosis.left
         ),
         notes=notes(diagnosis), interrupted=interrupted, partly=shortfalls(diagnosis),
+        declared_units=dict(zip(after, own, strict=bool(own))),
     )  # fmt: skip
 
 

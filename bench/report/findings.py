@@ -79,15 +79,17 @@ def added(diagnosis: Diagnosis) -> tuple[AddedEffect, ...]:
                 effect=one.name, said=tuple(in_sentence(line, units) for line in placed.sentences(chain)),
                 parameters=placed.settings(),
                 coefficients=dict(zip(labels, placed.strength, strict=True)), stderr=errors,
-                natural={name: _in_units(name, size, units) for name, size in _with_errors(one, natural).items()},
+                natural={
+                    name: _in_units(name, size, units, chain.order) for name, size in _with_errors(one, natural).items()
+                },
                 evidence=one.evidence, indistinguishable=one.alternatives,
             )
         )  # fmt: skip
     return tuple(found)
 
 
-def _in_units(name: str, size: Size, units: Units) -> Size:
-    factor, unit = of_natural(name, units)
+def _in_units(name: str, size: Size, units: Units, order: int) -> Size:
+    factor, unit = of_natural(name, units, order)
     return Size(value=size.value * factor, stderr=size.stderr * abs(factor), unit=unit)
 
 

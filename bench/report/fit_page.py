@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 from latticebench.bench.overlay import Overlay
 from latticebench.bench.plots import panels, plot
 from latticebench.bench.provenance import lines
+from latticebench.bench.report import rows
 from latticebench.bench.report.document import Provenance
 from latticebench.bench.report.mathematics import written
 from latticebench.bench.report.page import environment
+from latticebench.bench.report.units import UNKNOWN, Units
 from latticebench.systems.files import write_text
 
 if TYPE_CHECKING:
@@ -31,34 +33,35 @@ CAPTIONS = {
 }
 
 
-def write_fit_page(found: Fit, overlay: Overlay, quality: Adequacy, about: Provenance | None, path: Path) -> None:
+def write_fit_page(
+    found: Fit, overlay: Overlay, quality: Adequacy, units: Units, about: Provenance | None, path: Path
+) -> None:
     """Write the page of a fit, whole or not at all.
 
     Args:
         found: the fit.
         overlay: its readings and curves.
         quality: how well the equation fits.
+        units: of the recording.
         about: where it comes from.
         path: the file.
 
     Raises:
         InputError: it cannot be written.
     """
-    write_text(path, fit_page(found, overlay, quality, about))
+    write_text(path, fit_page(found, overlay, quality, units, about))
 
 
-def fit_page(found: Fit, overlay: Overlay, quality: Adequacy, about: Provenance | None = None) -> str:
+def fit_page(
+    found: Fit, overlay: Overlay, quality: Adequacy, units: Units = UNKNOWN, about: Provenance | None = None
+) -> str:
     """Return the page of a fit; the arguments are those of `write_fit_page`."""
     made = environment()
     style, _, _ = made.loader.get_source(made, "diagnosis.css")  # type: ignore[union-attr]
-    columns = ["term", "coefficient", *([] if found.stderr is None else ["standard error"])]
-    errors = [None] * len(found.coefficients) if found.stderr is None else found.stderr.tolist()
-    rows = [
-        [text, f"{value:.6g}", *([] if error is None else [f"{error:.2g}"])]
-        for text, value, error in zip(found.library.texts, found.coefficients.tolist(), errors, strict=True)
-    ]
+    columns, cells = rows.fitted(found, units)
     return made.get_template("fit.html.j2").render(
-        found=found, overlay=overlay, quality=quality, style=style, equation=written(found), columns=columns, rows=rows,
+        found=found, overlay=overlay, quality=quality, style=style, equation=written(found),
+        columns=columns, rows=cells,
         pictures={name: (CAPTIONS[name], _svg(overlay, name)) for name in panels(overlay)},
         origin=[] if about is None else [line.partition(": ")[::2] for line in lines(about.model_dump())],
     )  # fmt: skip

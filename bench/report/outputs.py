@@ -10,11 +10,12 @@ from pydantic import BeforeValidator, Field, JsonValue
 
 from latticebench.bench.report.document import Content, Document, Number, Provenance
 from latticebench.bench.report.shown import Shown
-from latticebench.bench.report.units import Units
+from latticebench.bench.report.units import Units, of_coefficients
 
 if TYPE_CHECKING:
     from latticebench.bench.adequacy import Adequacy
     from latticebench.bench.against import Contest
+    from latticebench.bench.bounds import BoundOf
     from latticebench.bench.compare import Comparison
     from latticebench.bench.inspection import Inspection
     from latticebench.bench.limit import Design, Limit
@@ -49,6 +50,7 @@ class FitDocument(Document):
         warnings: what has to be known before a number is used; empty where the equation fits.
         units: of times, readings and the equation.
         shown: what `latticebench plot` draws of it; None in a document of a version that did not draw.
+        coefficient_units: of the coefficients by term; "" where one is not known, empty where none is.
     """
 
     schema_: Literal["latticebench/fit/1"] = Field(
@@ -65,6 +67,7 @@ class FitDocument(Document):
     warnings: list[str]
     units: Units
     shown: Shown | None = None
+    coefficient_units: dict[str, str] = {}
 
 
 class TermLimit(Content):
@@ -100,6 +103,7 @@ class LimitDocument(Document):
         groups: terms that are hard to tell apart.
         needed: what a smaller error needs.
         warnings: why the bound may not hold; empty where nothing speaks against it.
+        coefficient_units: of the coefficients by term; "" where one is not known, empty where none is.
     """
 
     schema_: Literal["latticebench/limit/1"] = Field(
@@ -115,6 +119,7 @@ class LimitDocument(Document):
     groups: list[list[str]]
     needed: Needed
     warnings: list[str]
+    coefficient_units: dict[str, str] = {}
 
 
 class FitRow(Content):
@@ -392,7 +397,7 @@ def fit_document(
     found: Fit, quality: Adequacy, units: Units, about: Provenance, overlay: Overlay | None = None
 ) -> FitDocument:
     """Return the document of a fit, with what is drawn of it."""
-    texts = found.library.texts
+    texts, own = found.library.texts, of_coefficients(found.library.terms, found.order, units)
     return FitDocument(
         provenance=about, method=found.method, order=found.order,
         coefficients=dict(zip(texts, map(float, found.coefficients), strict=True)),
@@ -400,25 +405,24 @@ def fit_document(
         residual=found.residual, seconds=found.seconds, status=quality.state(found.status),
         quality=Quality(work=quality.work, r2=quality.r2, times=quality.times, fits=quality.fits),
         warnings=list(quality.warnings), units=units,
-        shown=None if overlay is None else Shown.of(overlay),
+        shown=None if overlay is None else Shown.of(overlay), coefficient_units=dict(zip(texts, own, strict=bool(own))),
     )  # fmt: skip
 
 
-def limit_document(
-    found: Limit, needed: Design, note: str, about: Provenance, warnings: Sequence[str] = ()
-) -> LimitDocument:
-    """Return the document of a bound; `note` says where it was taken."""
+def limit_document(found: Limit, needed: Design, bound: BoundOf, about: Provenance) -> LimitDocument:
+    """Return the document of a bound and of what a wanted one needs."""
     texts = found.library.texts
     rows = zip(texts, found.coefficients, found.stderr, found.errors, found.verdicts, strict=True)
     return LimitDocument(
-        provenance=about, about=note, noise=found.noise, samples=found.samples, span=found.span,
+        provenance=about, about=bound.note, noise=found.noise, samples=found.samples, span=found.span,
         conditioning=found.conditioning, relative=found.relative,
         terms={
             text: TermLimit(coefficient=value, stderr=stderr, error=error, verdict=verdict)
             for text, value, stderr, error, verdict in rows
         },
         groups=[[texts[k] for k in group] for group in found.groups],
-        needed=Needed(**dataclasses.asdict(needed)), warnings=list(warnings),
+        needed=Needed(**dataclasses.asdict(needed)), warnings=list(bound.warnings),
+        coefficient_units=dict(zip(texts, bound.units, strict=bool(bound.units))),
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The tables of a diagnosis as rows of texts, the same on the terminal and on the page."""
+"""The tables of a fit and of a diagnosis as rows of texts, the same on the terminal and on the page."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 from latticebench.bench.report.content import Left, Report
 from latticebench.bench.report.horizons import Candidate
 from latticebench.bench.report.modes import Mode
-from latticebench.bench.report.units import with_unit
+from latticebench.bench.report.units import Units, of_coefficients, with_unit
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from latticebench.methods.method import Fit
 
 Table = tuple[list[str], list[list[str]]]
 
@@ -21,6 +23,17 @@ SHOWN = 8
 LISTED = 10
 # A forecast that is so many times as large as the readings has run away.
 DIVERGED = 1000.0
+
+
+def fitted(found: Fit, units: Units) -> Table:
+    """Return the terms of a fit with their coefficients, standard errors and units, as far as they are known."""
+    texts = found.library.texts
+    columns = {"term": list(texts), "coefficient": [f"{value:.6g}" for value in found.coefficients.tolist()]}
+    if found.stderr is not None:
+        columns["standard error"] = [f"{error:.2g}" for error in found.stderr.tolist()]
+    if own := of_coefficients(found.library.terms, found.order, units):
+        columns["unit"] = own
+    return list(columns), [list(row) for row in zip(*columns.values(), strict=True)]
 
 
 def effects(report: Report) -> Table:
@@ -60,6 +73,9 @@ def coefficients(report: Report) -> Table:
         [text, f"{report.declared_before[text]:.6g}", f"{value:.6g}", f"{report.declared_stderr[text]:.2g}"]
         for text, value in report.declared.items()
     ]
+    if report.declared_units:
+        columns.append("unit")
+        rows = [[*row, unit] for row, unit in zip(rows, report.declared_units.values(), strict=True)]
     if report.declared_truth is not None:
         columns.append("truth")
         rows = [[*row, f"{value:.6g}"] for row, value in zip(rows, report.declared_truth.values(), strict=True)]

@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from latticebench.bench.report import rows
 from latticebench.bench.report.mathematics import written
+from latticebench.bench.report.units import UNKNOWN, Units, in_words
 from latticebench.systems.errors import printable
 
 if TYPE_CHECKING:
@@ -29,7 +31,7 @@ def console() -> Console:
     return Console() if sys.stdout.isatty() else Console(width=200)
 
 
-def show_rows(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+def show_rows(columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
     """Print a table; lists and dictionaries within a cell are written out."""
     from rich import box
     from rich.table import Table
@@ -37,7 +39,7 @@ def show_rows(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     table = Table(box=box.SIMPLE_HEAD)
     for name in columns:
         table.add_column(_shown(str(name)), overflow="fold")
-    for row in rows:
+    for row in cells:
         table.add_row(*(_shown(_text(value)) for value in row))
     console().print(table)
 
@@ -63,16 +65,11 @@ def show_warnings(warnings: Sequence[str]) -> None:
         console().print(f"Warning: {line}.", style="bold red", highlight=False, markup=False, soft_wrap=True)
 
 
-def show_fit(fit: Fit, quality: Adequacy | None = None, units: str = "") -> None:
+def show_fit(fit: Fit, quality: Adequacy | None = None, units: Units = UNKNOWN) -> None:
     """Print a fit: what is wrong with it, its coefficients, its equation, and what it leaves."""
     if quality is not None:
         show_warnings(quality.warnings)
-    columns = ["term", "coefficient"]
-    rows = [[text, f"{value:.6g}"] for text, value in zip(fit.library.texts, fit.coefficients, strict=True)]
-    if fit.stderr is not None:
-        columns.append("standard error")
-        rows = [[*row, f"{error:.2g}"] for row, error in zip(rows, fit.stderr, strict=True)]
-    show_rows(columns, rows)
+    show_rows(*rows.fitted(fit, units))
     left = (
         ""
         if fit.residual != fit.residual
@@ -81,20 +78,26 @@ def show_fit(fit: Fit, quality: Adequacy | None = None, units: str = "") -> None
     )
     state = fit.status if quality is None else quality.state(fit.status)
     lines = [written(fit), f"{fit.method}: {state}{left}; {fit.seconds:.2f} s"]
-    if units:
-        lines.append(f"units: {units}")
+    if told := in_words(units):
+        lines.append(f"units: {told}")
     if quality is not None:
         lines.append(quality.in_words)
     for line in lines:
         console().print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
 
-def show_limit(limit: Limit, design: Design, note: str, warnings: Sequence[str] = ()) -> None:
+def show_limit(
+    limit: Limit, design: Design, note: str, warnings: Sequence[str] = (), units: Sequence[str] = ()
+) -> None:
     """Print a bound: warnings, each coefficient with its smallest error and a verdict, and what more would need."""
     show_warnings(warnings)
     columns = ["term", "coefficient", "smallest error", "verdict"]
-    rows = zip(limit.library.texts, limit.coefficients, limit.stderr, limit.verdicts, strict=True)
-    show_rows(columns, [[text, f"{value:.6g}", f"{error:.2g}", verdict] for text, value, error, verdict in rows])
+    every = zip(limit.library.texts, limit.coefficients, limit.stderr, limit.verdicts, strict=True)
+    cells = [[text, f"{value:.6g}", f"{error:.2g}", verdict] for text, value, error, verdict in every]
+    if units:
+        columns.insert(3, "unit")
+        cells = [[*row[:3], unit, *row[3:]] for row, unit in zip(cells, units, strict=True)]
+    show_rows(columns, cells)
     wanted = f"{100 * design.target:.3g} %"
     for group in limit.groups:
         listed = "; ".join(limit.library.texts[k] for k in group)

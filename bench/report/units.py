@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from latticebench.bench.escape import label
 from latticebench.bench.report.document import Content, Number
 from latticebench.diagnosis.instrument import describe
+from latticebench.systems.parser import TermError
+from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     from latticebench.diagnosis.noise import Noise
@@ -20,6 +22,9 @@ if TYPE_CHECKING:
 
 # Digits of a number within a sentence.
 DIGITS = 4
+# Numbers of effects that are times; what stands before a term that acts with a sign at every second site, or in time.
+TIMES = ("delay", "at", "width")
+IN_TIME = r"^(?:\(-1\)\^k|(?:cos|sin)\([^()]*\*t\)|exp\(-\(\(t-[^()]*\)/[^()]*\)\*\*2/2\))\*?"
 
 
 class Units(Content):
@@ -73,14 +78,59 @@ def with_unit(value: str, unit: str) -> str:
     return f"{value} {unit}".rstrip()
 
 
-def of_natural(name: str, units: Units) -> tuple[float, str]:
-    """Return the factor and the unit of an effect's number in its natural form, by its name."""
+def of_natural(name: str, units: Units, order: int = 2) -> tuple[float, str]:
+    """Return the factor and the unit of an effect's number in its natural form, by its name.
+
+    The number may be a coefficient of the equation: that of a term, at every site or at one, or of a term times a
+    function of time.
+    """
     if name.startswith(("offset of ", "drift of ")):
         return 1 / units.scale, units.reading
     if name.startswith("walk of "):
         # A standard deviation has no sign.
         return 1 / abs(units.scale), units.reading
-    return 1.0, units.time if name.endswith("time") else ""
+    if name == "omega":
+        return 1.0, rate_of("rad", units.time)
+    if name in TIMES or name.endswith(" time"):
+        return 1.0, units.time
+    try:
+        term = Term(re.sub(IN_TIME, "", re.sub(r"(?: at site \d+|\(t-[^()]*\))$", "", name)) or "1")
+    except TermError:
+        return 1.0, ""
+    return 1.0, of_coefficient(term, order, units)
+
+
+def of_coefficient(term: Term, order: int, units: Units) -> str:
+    """Return the unit of a term's coefficient, such as 1/s^2 of u[n] where order is 2; "" where it is not known.
+
+    A unit of the coefficient times that of the term is that of the highest derivative. A term that is no power of u, v
+    and f has a unit only where u is an angle in radians.
+    """
+    if not units.time or {"t", "n"} & term.names:
+        return ""
+    degrees = term.degrees
+    if degrees is None and units.equation == "rad" and "v" not in term.names:
+        degrees = (0.0, 0.0, 0.0)
+    if degrees is None or degrees[2]:
+        return ""
+    field, rate, _ = degrees
+    if field + rate != 1 and not units.equation:
+        return ""
+    powers = [(units.equation, 1 - field - rate), (units.time, rate - order)]
+    above = " ".join(_power(unit, power) for unit, power in powers if power > 0)
+    below = " ".join(_power(unit, -power) for unit, power in powers if power < 0)
+    return above if not below else f"{above or 1}/{f'({below})' if ' ' in below else below}"
+
+
+def _power(unit: str, power: float) -> str:
+    whole = f"({unit})" if re.search(r"\W", unit) else unit
+    return whole if power == 1 else f"{whole}^{power:g}"
+
+
+def of_coefficients(terms: Sequence[Term], order: int, units: Units) -> list[str]:
+    """Return the unit of each term's coefficient; none at all where no unit is known."""
+    found = [of_coefficient(term, order, units) for term in terms]
+    return found if any(found) else []
 
 
 def in_sentence(line: str, units: Units) -> str:

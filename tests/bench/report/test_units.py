@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.bench.report.units import Units, in_sentence, noise_in_words, of_natural
+from latticebench.bench.report.units import Units, in_sentence, noise_in_words, of_coefficient, of_natural
 from latticebench.diagnosis.noise import Noise, Structure
+from latticebench.systems.terms import Term
 
 # A sensor that counts backwards, in millimetres.
 MIRRORED = Units(time="s", reading="mm", equation="m", scale=-0.001)
@@ -35,3 +36,42 @@ def test_the_noise_says_how_far_a_zero_wanders_over_the_recording_in_that_unit()
     noise = Noise(np.array([0.001, 0.002]), 0.0, np.inf, np.zeros(2), Structure(own_sizes=True), np.array([0.0, 0.01]))
     lines = noise_in_words(noise, [0.0, 0.0], 0.1, 2, MIRRORED, span=25.0)
     assert lines == ["sensor 1: 1 mm", "sensor 2: 2 mm, a zero that wanders by 50 mm"]
+
+
+PENDULA = Units(time="s", reading="deg", equation="rad", scale=0.0174533)
+GLIDERS = Units(time="s", reading="mm", equation="mm", scale=1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "order", "units", "expected"),
+    [
+        ("u[n+1]+u[n-1]-2*u[n]", 2, GLIDERS, "1/s^2"), ("u[n]**3", 2, GLIDERS, "1/(mm^2 s^2)"),
+        ("v[n]", 2, GLIDERS, "1/s"), ("abs(v[n])*v[n]", 2, GLIDERS, "1/mm"), ("1", 2, GLIDERS, "mm/s^2"),
+        ("sign(v[n])", 2, GLIDERS, "mm/s^2"), ("abs(u[n])**2*u[n]", 1, GLIDERS, "1/(mm^2 s)"),
+        ("u[n]*v[n]**2", 2, GLIDERS, "1/mm^2"), ("(u[n+1]-u[n])**2/u[n]", 2, GLIDERS, "1/s^2"),
+        # What is no power has a unit of an angle alone; nobody knows that of an input, nor that of a function of time.
+        ("sin(u[n])", 2, PENDULA, "rad/s^2"), ("sin(u[n])", 2, GLIDERS, ""), ("u[n]+u[n]**3", 2, GLIDERS, ""),
+        ("sin(v[n])", 2, PENDULA, ""), ("f[n]", 2, GLIDERS, ""), ("cos(3*t)", 2, GLIDERS, ""),
+        # Without a unit of the readings that of a linear term is known, without one of time nothing.
+        ("u[n]", 2, Units(time="s", reading="", equation="", scale=1.0), "1/s^2"),
+        ("u[n]**3", 2, Units(time="s", reading="", equation="", scale=1.0), ""),
+        ("u[n]", 2, Units(time="", reading="mm", equation="mm", scale=1.0), ""),
+        ("u[n]**2", 2, Units(time="s", reading="m/s", equation="m/s", scale=1.0), "1/((m/s) s^2)"),
+    ],
+)  # fmt: skip
+def test_a_coefficient_has_the_unit_of_the_derivative_over_that_of_its_term(
+    text: str, order: int, units: Units, expected: str
+) -> None:
+    assert of_coefficient(Term(text), order, units) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("v[n]", "1/s"), ("u[n] at site 3", "1/s^2"), ("(-1)^k*u[n]", "1/s^2"), ("cos(2.5*t)", "mm/s^2"),
+        ("sin(2.5*t)*u[n]", "1/s^2"), ("exp(-((t-3)/0.5)**2/2)", "mm/s^2"), ("omega", "rad/s"), ("delay", "s"),
+        ("decay time", "s"), ("mass_ratio", ""), ("slowness of the clock", ""), ("u[n](t-0.3)", "1/s^2"),
+    ],
+)  # fmt: skip
+def test_numbers_of_effects_have_the_units_of_what_they_are(name: str, expected: str) -> None:
+    assert of_natural(name, GLIDERS) == (1.0, expected)
