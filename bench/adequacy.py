@@ -29,7 +29,7 @@ from latticebench.bench.overlay import motion_of
 from latticebench.diagnosis.instrument import two_digits
 from latticebench.diagnosis.problem import Spectrum
 from latticebench.methods.engine.bsplines import BSplines
-from latticebench.methods.engine.derivatives import DEGREE
+from latticebench.methods.engine.derivatives import DEGREE, differentiate
 from latticebench.methods.engine.dynamics import Dynamics, split_parts
 from latticebench.methods.engine.record import without_halves
 from latticebench.methods.engine.sensitivity import Stretches
@@ -108,7 +108,12 @@ class Adequacy:
         """The numbers in one line."""
         parts = []
         if np.isfinite(self.work):
-            parts.append(f"half a period ahead it leaves {two_digits(100 * self.work)} % of what the forces do")
+            # Of noisy readings much is left by a right equation, too.
+            by_noise = self.fits and self.work > SHARE and self.times <= TIMES
+            parts.append(
+                f"half a period ahead it leaves {two_digits(100 * self.work)} % of what the forces do"
+                + (", as much as the noise lets anybody see" if by_noise else "")
+            )
         if np.isfinite(self.r2):
             parts.append(f"R^2 = {self.r2:.4g}" if self.r2 > -1 else "R^2 < -1")
         hidden = "the readings have no noise" if self.silent else "the noise is not seen"
@@ -192,6 +197,13 @@ class _Course:
         """Where the equation is followed from, and for how many samples."""
         ahead = _ahead(self.samples)
         return np.unique(np.linspace(0, len(self.states) - 1 - ahead, MOST).round().astype(int)), ahead
+
+    def rates(self, order: int) -> Float[ndarray, "parts place site"]:
+        """Return the derivative of that order at the places, by a smoothing spline through the readings."""
+        field = split_parts(self.samples.u, self.samples.is_complex)
+        found = [differentiate(self.samples.t, field[:, part], "smoothing-spline") for part in range(field.shape[1])]
+        rate = np.stack([one.second if order == 2 else one.first for one in found])
+        return np.asarray(rate[:, self.places[0]][..., self.stretches.dynamics.moving])
 
 
 def _course(samples: Samples, fit: Fit, number: int) -> _Course:
@@ -281,10 +293,14 @@ def _ahead(samples: Samples) -> int:
 
 
 def _unknown(courses: Sequence[_Course], fit: Fit) -> tuple[str, ...]:
-    """Return the terms whose coefficients the readings do not determine."""
-    if fit.stderr is None:
-        return ()
+    """Return the terms whose coefficients the readings do not determine.
+
+    Where a method gives no standard errors they are those of a regression of the derivative on the terms it has kept.
+    That may be far worse than what the method does, so that only terms count which nearly cancel each other.
+    """
+    kept = fit.coefficients != 0
     squares, force, count = np.zeros(len(fit.library.terms)), 0.0, 0
+    products, left, equations = np.zeros((len(kept), len(kept))), 0.0, 0
     for one in courses:
         t, stretches = one.samples.t[one.places[0]], one.stretches
         f = None if stretches.inputs is None else stretches.inputs(t)
@@ -294,11 +310,25 @@ def _unknown(courses: Sequence[_Course], fit: Fit) -> tuple[str, ...]:
                 fit.coefficients, t, one.states[one.places[0]], f, driven, derivatives=False
             )[1]
             squares += np.sum(np.nan_to_num(values) ** 2, axis=(0, 2, 3))
-            force += float(np.sum(np.nan_to_num(np.tensordot(fit.coefficients, values, (0, 1))) ** 2))
+            forces = np.tensordot(fit.coefficients, values, (0, 1))
+            force += float(np.sum(np.nan_to_num(forces) ** 2))
         count += values[:, 0].size
+        if fit.stderr is None:
+            rates = one.rates(fit.order)
+            known = np.isfinite(rates) & np.isfinite(forces)
+            rows = np.moveaxis(values, 1, -1)[known]
+            products += rows.T @ rows
+            left, equations = left + float(np.sum((rates - forces)[known] ** 2)), equations + len(rows)
     with np.errstate(all="ignore"):
-        worth = np.sqrt(squares / count) * np.nan_to_num(fit.stderr, nan=np.inf)
-        lost = worth > UNKNOWN * np.sqrt(force / count) + TINY
+        scale = np.sqrt(squares / count)
+        most = UNKNOWN * np.sqrt(force / count) + TINY
+        if fit.stderr is None:
+            of_kept = np.linalg.pinv(products[np.ix_(kept, kept)], hermitian=True).diagonal()
+            errors = np.zeros(len(kept))
+            errors[kept] = np.sqrt(np.abs(of_kept) * left / max(equations - int(np.sum(kept)), 1))
+            lost = (scale * errors > most) & (scale * np.abs(fit.coefficients) > most)
+        else:
+            lost = scale * np.nan_to_num(fit.stderr, nan=np.inf) > most
     return tuple(text for text, unsure in zip(fit.library.texts, lost, strict=True) if unsure)
 
 

@@ -26,7 +26,7 @@ def _seeds(value: Any) -> Any:
         return _listed(value)
     found: list[int] = []
     for part in value.split(","):
-        ends = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", part)
+        ends = re.fullmatch(r"\s*([0-9]{1,9})\s*(?:-\s*([0-9]{1,9})\s*)?", part)
         first, last = (0, -1) if ends is None else (int(ends[1]), int(ends[2] or ends[1]))
         if last < first or last - first + len(found) >= MOST_SEEDS:
             raise ValueError(f'write at most {MOST_SEEDS} seeds as "1-100", the smaller one first, or as "1,3,7"')

@@ -14,12 +14,14 @@ if TYPE_CHECKING:
 FORMULA = ("=", "+", "-", "@")
 # What a less-than sign must stand before for it to begin an element of HTML, a remark, or a link.
 BEGINS = re.compile(r"<(?=[A-Za-z/!?])")
+# Signs that end a cell or begin mathematics.
+SIGNS = str.maketrans({"|": r"\|", "$": "&#36;"})
 NUMBER = re.compile(r"[+-]?(inf|nan|(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?)")
 
 
 def markdown(text: str) -> str:
-    """Return a text for a cell of a Markdown table: it begins no element of HTML, is no link, and ends no cell."""
-    return re.sub(r"\](?=[(\[])", "&#93;", BEGINS.sub("&lt;", printable(text))).replace("|", r"\|")
+    """Return a text for a cell of a Markdown table: it begins no HTML or mathematics, is no link, and ends no cell."""
+    return re.sub(r"\](?=[(\[])", "&#93;", BEGINS.sub("&lt;", printable(text))).translate(SIGNS)
 
 
 def csv_cell(value: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -256,7 +257,7 @@ def cost(table: pd.DataFrame) -> Figure:
         axes.set_yscale("log")
         axes.grid(alpha=0.25)
         axes.set_title(f"{system}, {library}, {100 * noise:g} % noise", fontsize=8)
-    figure.supxlabel("processor seconds of the fit", fontsize=9)
+    figure.supxlabel(f"processor seconds of the fit{_published(table)}", fontsize=9)
     figure.supylabel("relative error of the coefficients, E2", fontsize=9)
     figure.legend(*grid[0][0].get_legend_handles_labels(), fontsize=8, loc="outside right center", frameon=False)
     return figure
@@ -272,9 +273,9 @@ def _by_noise(table: pd.DataFrame) -> pd.DataFrame:
 def error_against_noise(table: pd.DataFrame) -> Figure:
     """Draw E2 against the noise level, one line per method, one panel per system and library.
 
-    A line is the median over the seeds, the bar at it holds their middle 80 %, and the dashed line is the Cramer-Rao
-    bound. With two noise levels or more, the noise-free cases are left to the tables: their errors are of another
-    order.
+    A line is the median over the seeds, the bar at it goes from their 10 % to their 90 % quantile, and the dashed line
+    is the Cramer-Rao bound. With two noise levels or more, the noise-free cases are left to the tables: their errors
+    are of another order.
     """
     import matplotlib.pyplot as plt
     from matplotlib.ticker import NullLocator
@@ -297,8 +298,7 @@ def error_against_noise(table: pd.DataFrame) -> Figure:
     for axes, (system, library) in zip(grid.flat, panels, strict=False):
         here = known[(known["system"] == system) & (known["library"] == library)]
         # A little beside each other, since the best methods lie on one line.
-        apart = 0.0 if alone else 0.014
-        for name, line in _noise_curves(axes, here, methods, apart).items():
+        for name, line in _noise_curves(axes, here, methods, 0.014).items():
             handles.setdefault(name, line)
         if alone:
             axes.set_xscale("symlog", linthresh=noisy["noise"].min())
@@ -313,8 +313,8 @@ def error_against_noise(table: pd.DataFrame) -> Figure:
     grid[0][0].set_ylim(_lowest(known, alone), HIGHEST)
     for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
-    figure.supxlabel("noise level: sigma over the RMS of the field", fontsize=9)
-    figure.supylabel("E2 (median over seeds, with the middle 80 %)", fontsize=9)
+    figure.supxlabel(f"noise level: sigma over the RMS of the field{_published(table)}", fontsize=9)
+    figure.supylabel("E2 (median over seeds, 10 % to 90 % quantile)", fontsize=9)
     ordered = sorted(handles.items(), key=lambda item: item[0] == BOUND)
     figure.legend(handles=[line for _, line in ordered], fontsize=8, loc="outside right center", frameon=False)
     return figure
@@ -338,7 +338,10 @@ def _noise_curves(axes: Axes, here: pd.DataFrame, methods: Sequence[str], apart:
         low, middle, high = (by_noise.quantile(share, interpolation="nearest") for share in (0.1, 0.5, 0.9))
         if middle.empty:
             continue
-        at = middle.index * 10 ** (apart * (k - (len(methods) - 1) / 2))
+        place = k - (len(methods) - 1) / 2
+        at = np.array(middle.index) * 10 ** (apart * place)
+        # Noise-free cases are where the axis is linear.
+        at[at == 0] = here["noise"].max() * apart * math.log(10) * place
         colour = series(k)
         axes.vlines(at, _bounded(low), np.minimum(high, HIGHEST), color=colour, alpha=0.35, lw=2.2)
         style = f"-{MARKERS[k % len(MARKERS)]}"

@@ -112,7 +112,7 @@ def _sensors(samples: Samples) -> Iterator[Sensor]:
         if not len(values):
             yield Sensor(name, 0, missing, np.nan, np.nan, np.nan, 0.0)
             continue
-        step = step_of(values - np.mean(values))
+        step = step_of(values)
         yield Sensor(
             name, len(field) - missing, missing, float(values.min()), float(values.max()), float(noise[site]), step
         )

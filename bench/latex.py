@@ -45,8 +45,8 @@ SPLIT = "scriptsize"
 LONGEST = 22
 CAPTIONS = {
     "errors": "Relative error E2 of the coefficients: the median over the seeds and, where there are several, their "
-    "middle 80 % in brackets. In parentheses, where the equation is outside the library: what the fit leaves of the "
-    "derivative.",
+    "10 % and 90 % quantiles in brackets, of at most five the least and the largest. In parentheses, where the "
+    "equation is outside the library: what the fit leaves of the derivative.",
     "cases": "Scores of each case.", "coefficients": "Coefficients of each fit and their truth.",
     "limits": "The smallest standard error that an unbiased method can have.",
     "summary": "Scores of each method, medians over the seeds.",

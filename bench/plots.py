@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # Chains shorter than this are drawn as lines: a map would have too few rows.
 MAPPED = 4
 # Sites with a line or a portrait of their own, and the samples that a line of readings with a fit has at most.
-MOST_SITES, MOST_SAMPLES = 6, 240
+MOST_SITES, MOST_SAMPLES = 8, 240
 WIDTH, HEIGHT = 5.6, 3.6
 # Coefficients with a name beside their learning curves, and steps so few that each has a dot.
 MOST_TERMS, FEW_STEPS = 8, 40
@@ -128,7 +128,8 @@ def lines_of_sites(part: SubFigure, overlay: Overlay) -> None:
         axes.set_ylabel(f"site {site + 1}" if crowded else axis(f"{name} at site {site + 1}", overlay.unit), fontsize=8)
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.25)
-    part_of_it = ", where the first curve is worst" if len(t) < len(overlay.t) else ""
+    first = label(next(iter(overlay.curves), ""))
+    part_of_it = f", the {len(t)} rows that {first!r} misses most" if len(t) < len(overlay.t) else ""
     every[-1].set_xlabel(axis("t", overlay.time_unit) + part_of_it + _of_all(sites, overlay))
     if overlay.curves:
         handles = every[0].get_legend_handles_labels()
@@ -155,7 +156,7 @@ def _kinds(curves: Mapping[str, ndarray]) -> dict[str, dict[str, str]]:
 
 
 def _telling(overlay: Overlay) -> tuple[list[int], slice]:
-    """Return the sites and rows whose lines are drawn: those that move most or where the first curve is worst."""
+    """Return the sites and rows whose lines are drawn: those that move most, or that the first curve misses most."""
     if not overlay.curves:
         return overlay.moving(MOST_SITES), slice(None)
     left = np.nan_to_num(overlay.residual(next(iter(overlay.curves))) ** 2, posinf=0.0).sum(axis=1)

@@ -32,8 +32,8 @@ LEADING = re.compile(r"(inf|\d+(?:\.\d+)?(?:e[+-]\d+)?)(?: |$)")
 def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
     """Arrange the summary as part, data and library against method; a cell without a figure says why.
 
-    A cell is the median over the seeds; where there are several, their middle 80 % and number follow. The bound stands
-    beside errors where it is known.
+    A cell is the median over the seeds; where there are several, their 10 % and 90 % quantiles and number follow; of at
+    most five that is the least and the largest. The bound stands beside errors where it is known.
     """
     short = summary(table, value)
     if short.empty:

@@ -33,7 +33,7 @@ FILE = "results.sqlite"
 # In the head of the file, by which a store is known: "LtBn".
 APPLICATION = 0x4C74426E
 # Seconds to wait for another run that is writing.
-PATIENCE = 60.0
+PATIENCE = 15.0
 # A file with its journal, while it is being made or written.
 OWN_FILES = tuple(FILE + ending for ending in ("", "-wal", "-shm", "-journal"))
 TABLES = """

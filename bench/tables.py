@@ -154,6 +154,8 @@ def counted(table: pd.DataFrame) -> pd.DataFrame:
     # Where fits ended and yet none has an E2, there is no truth.
     ended = (found["status"] == "ok").groupby([found[name] for name in ABOUT]).transform("any")
     no_truth = ended & found.groupby(ABOUT)["e2"].transform(lambda e: bool(e.isna().all()))
+    for name in ("e2", "einf", "forecast_error", "tpr", "forecast_horizon"):
+        found[name] = found[name].astype(float) if name in found else np.nan
     found.loc[missed & ~no_truth, ["e2", "einf", "forecast_error"]] = np.inf
     found.loc[missed, ["tpr", "forecast_horizon"]] = 0.0
     return found

@@ -117,7 +117,7 @@ def _text(error: BaseException) -> str:
     """Return what an error says; one of a user's may fail to say anything."""
     try:
         return str(error)
-    except Exception:
+    except BaseException:
         return "it says nothing"
 
 

@@ -25,6 +25,7 @@ import pandas as pd
 from latticebench.bench import calls
 from latticebench.bench.overlay import of_diagnosis
 from latticebench.bench.report.rows import html_table
+from latticebench.diagnosis.cure import Cure, corrected, cure
 from latticebench.exhibit import Exhibit
 from latticebench.pictures import FROM_PYTHON
 from latticebench.recording import Model, Recording
@@ -45,6 +46,7 @@ class Cause(Exhibit):
         result: all that is known (`latticebench.diagnosis.repair.Diagnosis`).
         report: what is said of it.
         declared: the equation that was examined.
+        recording: the recording that it was examined on.
 
     Examples:
         >>> import latticebench as lb
@@ -57,7 +59,7 @@ class Cause(Exhibit):
         'explained'
         >>> cause.model
         Model("u[n]; v[n]", order=2, ends="free")
-        >>> again = lb.fit(data, cause.model)
+        >>> again = lb.fit(cause.corrected, cause.model)
         >>> round(float(again.table.loc["v[n]", "coefficient"]), 2)
         -0.1
         >>> cause.plot("sites")
@@ -67,6 +69,7 @@ class Cause(Exhibit):
     result: Diagnosis
     report: Report
     declared: Model
+    recording: Recording
 
     @property
     def verdict(self) -> str:
@@ -91,14 +94,30 @@ class Cause(Exhibit):
         columns, body = rows.errors(self.report)
         return pd.DataFrame(body, columns=columns)
 
+    @functools.cached_property
+    def _cure(self) -> Cure:
+        return cure(self.result.after.model, self.result.after.chain)
+
     @property
     def model(self) -> Model:
-        """The declared terms and those found that act at every site, to be fitted again.
+        """The declared terms and those found, to be fitted again to `corrected`.
 
-        What acts at single sites, at the ends and on the readings is in `elsewhere`; a term cannot say it.
+        What acts at one site alone is a term that is 0 at the others; what has a frequency or a time of its own keeps
+        it. What no term can say is in `left_out`.
         """
-        terms = "; ".join(one.text for one in self.report.equation.after.terms)
-        return Model(terms, self.declared.order, self.declared.ends)
+        return Model("; ".join(self._cure.terms), self.declared.order, self._cure.ends)
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The effects that neither `model` nor `corrected` has: memory, a clock, a zero that wanders."""
+        wandering = [one.name for one in self.result.findings if one.placed.wandering() is not None]
+        return (*self._cure.left_out, *wandering)
+
+    @functools.cached_property
+    def corrected(self) -> Recording:
+        """The recording as it would read without the offsets, drifts, factors and bends that were found."""
+        model = self.result.after.model
+        return Recording(tuple(corrected(model, one) for one in self.recording.samples))
 
     @property
     def elsewhere(self) -> tuple[str, ...]:
@@ -127,7 +146,10 @@ class Cause(Exhibit):
 
     def __repr__(self) -> str:
         lines = [self.report.sentence, self.report.equation.after.text]
-        return "\n".join([*lines, *(f"    {line}" for line in self.elsewhere)])
+        lines += [f"    {line}" for line in self.elsewhere]
+        left_out = f"; without {', '.join(self.left_out)}" if self.left_out else ""
+        again = [f"to fit it again: lb.fit(cause.corrected, cause.model){left_out}"] if self.report.effects else []
+        return "\n".join([*lines, *again])
 
     def _repr_html_(self) -> str:
         # In a frame, so that the page's styles stay its own.
@@ -158,7 +180,7 @@ def diagnose(
         every[:count], model.library, model.order, effects=None if effects is None else Path(effects),
         later=every[count:],
     )  # fmt: skip
-    return Cause(found, report, model)
+    return Cause(found, report, model, data)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,10 +315,17 @@ class Run:
     statuses: Mapping[str, int]
 
     def table(self) -> pd.DataFrame:
-        """Return one row per case."""
-        from latticebench.bench.compare import read_run
+        """Return one row per case, as `latticebench table --out` publishes it: what was run, status, scores, seconds.
 
-        return read_run(self.folder)
+        What differs between the kinds of cases of a suite, fits and trials of the diagnosis, is empty where it has no
+        meaning.
+        """
+        from latticebench.bench.kinds import rows
+        from latticebench.bench.store import open_store
+
+        found = pd.DataFrame(rows(open_store(self.folder)))
+        last = [name for name in ("settings", "reason", "identity") if name in found]
+        return found[[name for name in found if name not in last] + last]
 
     def __repr__(self) -> str:
         return (

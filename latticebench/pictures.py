@@ -40,6 +40,13 @@ class _Drawn(ABC):
     def on(self, figure: Figure | None) -> Figure:
         """Draw on a figure of one's own, such as `pyplot.figure()`, which gets the size that is needed."""
 
+    def show(self) -> None:
+        """Show it in a window, as pyplot does; a notebook shows it without."""
+        import matplotlib.pyplot as plt
+
+        self.on(plt.figure())
+        plt.show()
+
     def save(self, path: str | Path) -> Path:
         """Write a .png, .svg or .pdf file with its provenance, whole or not at all.
 

@@ -176,7 +176,11 @@ def read(
     if isinstance(source, tuple) and len(source) == 2 and not isinstance(source[0], (str, Path)):
         t, u = cast("tuple[ArrayLike, ArrayLike]", source)
         return Recording(tuple(from_arrays(t, u, "arrays", "unknown", layout)))
-    if not isinstance(source, (str, Path)) and (hasattr(source, "dtype") or not isinstance(source, Sequence)):
+    if not isinstance(source, (str, Path)) and (
+        hasattr(source, "dtype")
+        or not isinstance(source, Sequence)
+        or not all(isinstance(one, (str, Path)) for one in source)
+    ):
         kind = type(source).__name__
         raise InputError(f"{kind}: give times and readings as a pair (t, u), a table, or the name of a file")
     paths = [source] if isinstance(source, (str, Path)) else list(cast("Sequence[str | Path]", source))

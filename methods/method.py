@@ -247,7 +247,7 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
         importlib.import_module(package)
     wall, cpu = time.perf_counter(), time.process_time()
     fit = method.fit(shown, library, order, seed)
-    _check_returned(fit, library)
+    _check_returned(fit, library, order)
     return replace(fit, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
 
 
@@ -260,7 +260,7 @@ def _check_settings(method: Method) -> None:
                 make(type(method), {name: value})
 
 
-def _check_returned(fit: Any, library: Library) -> None:
+def _check_returned(fit: Any, library: Library, order: int) -> None:
     """Refuse what is no fit of a library; a method of a user's may return anything."""
     if not isinstance(fit, Fit):
         raise TypeError(f"fit() returned {type(fit).__name__}; it must return a Fit")
@@ -271,6 +271,10 @@ def _check_returned(fit: Any, library: Library) -> None:
         raise ValueError("the coefficients are not finite")
     if fit.library.texts != library.texts:
         raise ValueError("the fit is of another library; return the one that fit() was given")
+    if fit.order != order:
+        raise ValueError(f"the fit is of order {fit.order!r}; return the one that fit() was given, {order}")
+    if fit.stderr is not None and np.any(fit.stderr < 0):
+        raise ValueError("a standard error is negative")
     if not isinstance(fit.status, str) or len(fit.status) > MOST_SAID:
         raise TypeError(f"status must be a text of at most {MOST_SAID} characters")
     if not isinstance(fit.residual, numbers.Real):

@@ -154,8 +154,8 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path | No
         inputs: what the same call reads.
 
     Raises:
-        InputError: an output is an input, or another output; it is a folder, a pipe or a device; or its folder cannot
-            be written to.
+        InputError: an output is an input, lies in one that is a folder, or is another output; it is a folder, a pipe
+            or a device; or its folder cannot be written to.
     """
     given = {option: path for option, path in outputs.items() if path is not None}
     read = [path for path in inputs if path is not None]
@@ -163,6 +163,10 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path | No
         for other in read:
             if _same(path, other):
                 raise InputError(f"{option} {shown(path)}: this file is read by the same command; write to another")
+            if _lies_in(path, other):
+                raise InputError(
+                    f"{option} {shown(path)}: it lies in {shown(other)}, which the same command reads; write elsewhere"
+                )
         for before, other in list(given.items())[:number]:
             if _same(path, other):
                 raise InputError(f"{option} {shown(path)}: {before} writes to the same file; give each its own")
@@ -175,6 +179,11 @@ def _same(one: Path, other: Path) -> bool:
     except (OSError, ValueError):
         # One of the two does not exist yet.
         return os.path.realpath(one) == os.path.realpath(other)
+
+
+def _lies_in(path: Path, folder: Path) -> bool:
+    """Return whether a file lies in a folder of data, or would."""
+    return os.path.isdir(folder) and Path(os.path.realpath(folder)) in Path(os.path.realpath(path)).parents
 
 
 def _check_place(option: str, path: Path) -> None:

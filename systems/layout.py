@@ -184,6 +184,8 @@ def choose(header: Sequence[str], layout: Layout, source: str, units: Mapping[st
             names[name] = name
     standard = {new: old for old, new in names.items()}
     left = [name for name in header if name not in names]
+    if layout.time and time != "t" and "t" in left:
+        left.remove("t")
     wrong = [name for name in left if NEARLY.fullmatch(name)] if not layout.columns else []
     if wrong:
         raise InputError(
@@ -270,7 +272,7 @@ def _notes(layout: Layout, origin: Origin, time: str, left: Sequence[str]) -> li
         unit = f" in {origin.unit}" if origin.unit else ""
         into = f", {origin.becomes} in the equation" if origin.becomes not in ("", origin.unit) else ""
         into = into or (f", times {origin.scale:g} in the equation" if origin.scale != 1 else "")
-        notes.append(f"{times}; sites 1 to {len(origin.columns)} from {listing(origin.columns)}{unit}{into}")
+        notes.append(f"{times}; {_sites(len(origin.columns))} from {listing(origin.columns)}{unit}{into}")
     elif layout.time_factor != 1:
         notes.append(times)
     if origin.unit in ("deg", "arcmin") and origin.scale == 1:
@@ -279,6 +281,10 @@ def _notes(layout: Layout, origin: Origin, time: str, left: Sequence[str]) -> li
         notes.append(f"not read: {', '.join(quoted(name)[1:-1] for name in left[:LISTED])}"
                      f"{f' and {len(left) - LISTED} more' if len(left) > LISTED else ''}")  # fmt: skip
     return notes
+
+
+def _sites(count: int) -> str:
+    return f"sites 1 to {count}" if count > 1 else "site 1"
 
 
 def listing(names: Sequence[str]) -> str:
@@ -299,7 +305,7 @@ def _told(header: Sequence[str]) -> str:
 
 def suggestion(header: Sequence[str], layout: Layout) -> str:
     """Return the options that would read a table, as a part of a sentence."""
-    cells = [cell for name in header for cell in name.split()]
+    cells = [cell for name in header for cell in re.split(r"[\s;]+", name) if cell]
     if all(map(NUMERIC.fullmatch, cells)):
         columns = ",".join(["t", *(f"u{k}" for k in range(1, min(len(cells), 4)))])
         return f"; the file has no header: write a first row such as {columns} with a name for each column"

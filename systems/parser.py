@@ -113,6 +113,9 @@ class _Whitelist(ast.NodeVisitor):
     def generic_visit(self, node: ast.AST) -> None:
         raise self.refuse(node, f"{type(node).__name__} is not part of the term language")
 
+    def visit_Tuple(self, node: ast.Tuple) -> None:
+        raise self.refuse(node, "several terms have ; between them, no comma")
+
     def visit_Constant(self, node: ast.Constant) -> None:
         if isinstance(node.value, bool) or not isinstance(node.value, (int, float)):
             hint = "; write i*u[n] for the imaginary unit" if isinstance(node.value, complex) else ""
@@ -205,7 +208,7 @@ def site_offset(node: ast.expr) -> int | None:
 def _number(node: ast.expr) -> float | None:
     """Return the value of a tree of numbers: None if it holds anything else, inf if it is not a finite real number."""
     match node:
-        case ast.Constant(value=int() | float() as value):
+        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value) if abs(value) <= 1e300 else math.inf
         case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=operand):
             inner = _number(operand)

@@ -23,7 +23,7 @@ from latticebench.systems.arrays import IN_MEMORY
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import DATA, check_regular, reading, shown
 from latticebench.systems.folders import ZARR, files_in, partition, zarr_arrays
-from latticebench.systems.layout import UNITS, Layout, choose, quoted
+from latticebench.systems.layout import UNITS, Layout, choose, listing, quoted
 from latticebench.systems.ordering import averaged, in_order, unwrapped
 from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
@@ -203,7 +203,7 @@ def _read_parquet(path: Path, layout: Layout) -> Table:
                     columns[name] = column.to_numpy().astype(str)
                 else:
                     _check_type(kind, name, path)
-                    columns[name] = column.cast(pa.float64()).to_numpy()
+                    columns[name] = _as_floats(column, name, path)
     except InputError:
         raise
     # A damaged file fails in many ways.
@@ -229,7 +229,9 @@ def from_frame(frame: pandas.DataFrame, source: str, ends: Ends = "unknown", lay
     Raises:
         InputError: a column is missing, or holds something else than numbers.
     """
-    named = frame.rename(columns=str)
+    time = layout.time or "t"
+    # A table of measurements often has its times as its index.
+    named = (frame.reset_index() if time in frame.index.names and time not in frame else frame).rename(columns=str)
     return _from_table(Table(named), source, ends, layout)
 
 
@@ -304,6 +306,10 @@ def _with_seconds(body: pandas.DataFrame, time: str, source: str) -> tuple[panda
 
 
 # As in tables, hours may pass a day.
+# Characters of what a library says of a damaged file.
+MOST_REASON = 200
+# A date as it is not read, since nobody knows which number is the month.
+DATE = re.compile(r"\d{1,2}[./-]\d{1,2}[./-]\d{2,4}", re.ASCII)
 CLOCK = r"\d{1,2}:[0-5]\d(:[0-5]\d(\.\d*)?)?"
 NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)|nan", re.ASCII | re.IGNORECASE)
 
@@ -319,9 +325,11 @@ def _numbers(table: pandas.DataFrame, column: str, source: str) -> ndarray:
     texts = ["nan" if gap else str(one).strip() for one, gap in zip(given.tolist(), missing.tolist(), strict=True)]
     for row, text in enumerate(texts):
         if not NUMBER.fullmatch(text):
+            remedy = (
+                "write dates as 2024-05-03 12:00:00" if DATE.match(text) else "leave the cell empty if it is missing"
+            )
             raise InputError(
-                f"{source}: row {row + 1}, column {column}: {quoted(str(given.iloc[row]))} is not a number; "
-                "leave the cell empty if the value is missing"
+                f"{source}: row {row + 1}, column {column}: {quoted(str(given.iloc[row]))} is not a number; {remedy}"
             )
     return np.array([float(text) for text in texts])
 
@@ -337,6 +345,26 @@ def _field(numbers: dict[str, ndarray], prefix: str, source: str) -> ndarray | N
             f"{source}: column {prefix}{missing} is missing; sites are numbered {prefix}1, {prefix}2, ... without gaps"
         )
     return np.column_stack([numbers[f"{prefix}{k}"] for k in found])
+
+
+def _as_floats(column: Any, name: str, path: Path) -> ndarray:
+    """Return a column of a Parquet table as floats.
+
+    Raises:
+        InputError: a whole number is too large to be one exactly.
+    """
+    import pyarrow as pa
+
+    try:
+        found: ndarray = column.cast(pa.float64()).to_numpy()
+    except pa.ArrowInvalid:
+        values = column.cast(pa.float64(), safe=False).to_numpy()
+        row = int(np.argmax(np.abs(np.nan_to_num(values)) > 2**53))
+        raise InputError(
+            f"{shown(path)}: row {row + 1}, column {name}: {values[row]:g} has more digits than a reading can have; "
+            "save the column as floats"
+        ) from None
+    return found
 
 
 # NPZ
@@ -361,7 +389,11 @@ def _read_npz(path: Path) -> dict[str, ndarray]:
         raise
     # A damaged archive fails in many ways: zipfile's, zlib's, NumPy's.
     except Exception as error:
-        reason = "it holds pickled objects, which are never loaded" if "pickle" in str(error).lower() else str(error)
+        reason = str(error).partition("\n")[0][:MOST_REASON]
+        if "pickle" in str(error).lower():
+            reason = "it holds pickled objects, which are never loaded"
+        elif "object at 0x" in reason:
+            reason = "the head of an array is damaged"
         raise InputError(
             f"{shown(path)}: not an NPZ file of plain arrays: {reason}; write it with numpy.savez(path, t=t, u=u)"
         ) from None
@@ -458,7 +490,7 @@ def _check_names(names: Sequence[str], source: str) -> None:
     """Refuse missing and unknown arrays."""
     for name in ("t", "u"):
         if name not in names:
-            raise InputError(f"{source}: the array {name!r} is missing; there are: {', '.join(map(quoted, names))}")
+            raise InputError(f"{source}: the array {name!r} is missing; there are: {listing(names)}")
     for name in names:
         if name not in ARRAYS:
             raise InputError(f"{source}: unknown array {quoted(name)}; known: {', '.join(ARRAYS)}")

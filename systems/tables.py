@@ -233,7 +233,9 @@ def read_sheet(path: Path, layout: Layout) -> Table:
         raise
     # A damaged file fails in many ways: zipfile's, the XML parser's, openpyxl's.
     except Exception as error:
-        raise InputError(f"{shown(path)}: not a spreadsheet: {str(error).partition(chr(10))[0]}") from None
+        raise InputError(
+            f"{shown(path)}: not a spreadsheet: {str(error).partition(chr(10))[0]}; save it anew as .xlsx or as .csv"
+        ) from None
     first = [[cell or "" for cell in row] for row in rows[:MOST_HEAD]]
     number = _head(first, lambda row: (layout.time or "t") in row, equal=False)
     if number is None:
@@ -259,10 +261,32 @@ def _rows_of_sheet(handle: Any, path: Path, time: str) -> tuple[list[list[str | 
         raise InputError(
             f"{shown(path)}: sheet {quoted(sheet.title)} has {len(rows)} row(s); it needs a header and data"
         )
+    if any(None in row for row in rows):
+        _check_formulas(handle, sheet, path)
     width = max(len(row) for row in rows)
     others = [one.title for one in book.worksheets if one is not sheet]
     notes = [f"sheet {quoted(sheet.title)} is read, not {', '.join(map(quoted, others))}"] if others else []
     return [[*row, *[None] * (width - len(row))] for row in rows], notes
+
+
+def _check_formulas(handle: Any, sheet: Any, path: Path) -> None:
+    """Refuse formulas whose values are not in the file, as where no spreadsheet program has ever saved it.
+
+    Raises:
+        InputError: there is one.
+    """
+    import openpyxl
+
+    handle.seek(0)
+    formulas = openpyxl.load_workbook(handle, read_only=True)[sheet.title]
+    every = zip(sheet.iter_rows(values_only=True), formulas.iter_rows(values_only=True), strict=False)
+    for number, (values, texts) in enumerate(every, 1):
+        for place, (value, text) in enumerate(zip(values, texts, strict=False), 1):
+            if value is None and isinstance(text, str) and text.startswith("="):
+                raise InputError(
+                    f"{shown(path)}: row {number}, column {place}: a formula whose value is not in the file; open it "
+                    "in a spreadsheet program and save it"
+                )
 
 
 def _names(sheet: Any, name: str) -> bool:

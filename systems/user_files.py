@@ -51,7 +51,7 @@ def raised(error: BaseException) -> str:
     """Return the type and text of an exception, and the last line of a user's file that it went through."""
     try:
         text = str(error)
-    except Exception:
+    except BaseException:
         # Code of the user's may raise anything.
         text = "it says nothing"
     lines = [

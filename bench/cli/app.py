@@ -103,8 +103,9 @@ def main() -> None:
     settle()
     disarm()
     prefer_one_thread()
-    # What NumPy remarks on its way to a refusal is no help to anybody.
-    warnings.filterwarnings("ignore", category=RuntimeWarning)
+    # What libraries remark on the way is no help to anybody; who looks for it has said so with -W.
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
     try:
         code = app(standalone_mode=False)
         sys.stdout.flush()

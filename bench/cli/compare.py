@@ -27,8 +27,10 @@ TABLES = (".csv", ".md", ".tex")
 
 
 def compare(
-    old: Annotated[Path, typer.Argument(help="A store, a folder of published tables, or one table.")],
-    new: Annotated[Path | None, typer.Argument(help="The same, to be judged; none with --against.")] = None,
+    old: Annotated[Path, typer.Argument(parser=place, help="A store, a folder of published tables, or one table.")],
+    new: Annotated[
+        Path | None, typer.Argument(parser=place, help="The same, to be judged; none with --against.")
+    ] = None,
     factor: Annotated[float, typer.Option(min=1.0, help="An error that grew beyond this factor is a loss.")] = 2.0,
     reference: Annotated[
         str | None, typer.Option("--against", metavar="METHOD", help="Compare the methods of one run with this one.")

@@ -21,7 +21,7 @@ EPILOG = "Example:  latticebench figures runs/default --out results/default"
 
 
 def figures(
-    folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
+    folder: Annotated[Path, typer.Argument(parser=place, help="A store of results.", metavar="DIR")],
     out: Annotated[
         Path | None,
         typer.Option(

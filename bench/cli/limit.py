@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from latticebench.bench.cli.arguments import asked, kept, numbers
-from latticebench.bench.cli.options import AnyEnds, JsonOut, Order, Settings, Terms, Yes, check_places, complete_systems
+from latticebench.bench.cli.options import (
+    AnyEnds,
+    JsonOut,
+    Order,
+    Settings,
+    Terms,
+    Yes,
+    check_places,
+    complete_systems,
+    place,
+)
 from latticebench.bench.cli.options import Library as LibraryName
 from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
 from latticebench.systems.errors import InputError
@@ -41,7 +51,8 @@ Ends = Annotated[
 
 def limit(
     files: Annotated[
-        list[Path] | None, typer.Argument(help="Recorded samples; without any, samples of --system are taken.")
+        list[Path] | None,
+        typer.Argument(parser=place, help="Recorded samples; without any, samples of --system are taken."),
     ] = None,
     system: System = None,
     library: LibraryName = None,

@@ -14,7 +14,9 @@ EPILOG = "Example:  latticebench merge runs/first runs/second --out runs/both"
 
 
 def merge(
-    folders: Annotated[list[Path], typer.Argument(help="Stores of results of one suite.", metavar="DIR...")],
+    folders: Annotated[
+        list[Path], typer.Argument(parser=place, help="Stores of results of one suite.", metavar="DIR...")
+    ],
     out: Annotated[Path, typer.Option(parser=place, metavar="DIR", help="The new store.")],
 ) -> None:
     """Put the results of several runs of one suite together, such as those of shards on several machines."""

@@ -8,6 +8,12 @@ from typing import Annotated, Literal
 
 import typer
 
+# What options write, and the endings of what they do not.
+WRITTEN = {"--json": (".json",), "--html": (".html", ".htm", ".xhtml")}
+OTHERS = (
+    ".png", ".svg", ".pdf", ".gif", ".mp4", ".jpg", ".jpeg", ".csv", ".md", ".tex", ".json", ".html", ".htm", ".xhtml",
+    ".xlsx", ".npz", ".parquet", ".zarr", ".toml", ".py", ".sqlite",
+)  # fmt: skip
 AnyEnds = Literal["unknown", "free", "fixed", "periodic", "antiperiodic"]
 KnownEnds = Literal["free", "fixed", "periodic", "antiperiodic"]
 
@@ -79,13 +85,19 @@ def check_places(inputs: Iterable[Path | str | None], **outputs: Path | str | No
         outputs: by their options; None and "-" (the screen) for none.
 
     Raises:
-        InputError: an output is not as it should be, see `latticebench.systems.files.check_outputs`.
+        InputError: an output has the ending of another kind of file, or is not as it should be, see
+            `latticebench.systems.files.check_outputs`.
     """
     from latticebench.bench.case import code_file
-    from latticebench.systems.files import check_outputs
+    from latticebench.systems.errors import InputError
+    from latticebench.systems.files import check_outputs, shown
 
     read = [Path(code_file(one) or one if isinstance(one, str) else one) for one in inputs if one is not None]
     given = {f"--{name}": Path(path) for name, path in outputs.items() if path not in (None, "-")}
+    for option, path in given.items():
+        written = WRITTEN.get(option, ())
+        if written and path.suffix.lower() in OTHERS and path.suffix.lower() not in written:
+            raise InputError(f"{option} {shown(path)}: it writes {written[0]}; give a name that ends so")
     check_outputs(given, read)
 
 

@@ -24,7 +24,9 @@ EPILOG = (
 
 
 def plot(
-    file: Annotated[Path, typer.Argument(help="A recording, or what `fit --json` or `diagnose --json` wrote.")],
+    file: Annotated[
+        Path, typer.Argument(parser=place, help="A recording, or what `fit --json` or `diagnose --json` wrote.")
+    ],
     out: Annotated[
         Path | None, typer.Option(parser=place, metavar="FILE", help="The picture to write: .png, .svg or .pdf.")
     ] = None,

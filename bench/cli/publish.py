@@ -15,7 +15,8 @@ EPILOG = "Example:  latticebench publish results/* --out site"
 
 def publish(
     folders: Annotated[
-        list[Path], typer.Argument(help="Folders of published tables, texts and pictures.", metavar="DIR...")
+        list[Path],
+        typer.Argument(parser=place, help="Folders of published tables, texts and pictures.", metavar="DIR..."),
     ],
     out: Annotated[
         Path, typer.Option(parser=place, metavar="DIR", help="Where to write the site; one that is there is replaced.")

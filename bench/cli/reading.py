@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.options import AnyEnds, named
+from latticebench.bench.cli.options import AnyEnds, named, place
 from latticebench.systems.errors import printable
 
 if TYPE_CHECKING:
@@ -20,9 +20,10 @@ PANEL = "How the recording lies in its file"
 Files = Annotated[
     list[Path],
     typer.Argument(
-        help="One or more .csv, .txt, .tsv, .dat, .xlsx, .parquet or .npz files, or folders of such, or .zarr."
+        parser=place, metavar="FILES...",
+        help="One or more .csv, .txt, .tsv, .dat, .xlsx, .parquet or .npz files, or folders of such, or .zarr.",
     ),
-]
+]  # fmt: skip
 Time = Annotated[
     str | None,
     typer.Option(

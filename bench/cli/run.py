@@ -245,7 +245,7 @@ def shard_of(text: str | None, cases: int) -> Shard:
 
     if text is None:
         return WHOLE
-    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip())
+    found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text.strip())
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         raise InputError(f"--shard {text}: write K/N with K from 1 to N, such as 1/10 for every tenth case")
     if int(found[1]) > cases:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from latticebench.bench.cli.arguments import kept
-from latticebench.bench.cli.options import Beside, check_places, place
+from latticebench.bench.cli.options import OTHERS, Beside, check_places, place
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import shown
 
@@ -25,7 +25,7 @@ EPILOG = (
 
 
 def table(
-    folder: Annotated[Path, typer.Argument(help="A store of results.", metavar="DIR")],
+    folder: Annotated[Path, typer.Argument(parser=place, help="A store of results.", metavar="DIR")],
     out: Annotated[
         Path | None,
         typer.Option(parser=place, metavar="DIR", help="Publish the tables here, as CSV, Markdown and LaTeX."),
@@ -48,6 +48,8 @@ def table(
     kinds.check_tables(only)
     store = open_store(folder)
     published = None if beside is None else read_published(beside)
+    if out is not None and out.suffix.lower() in OTHERS and not out.is_dir():
+        raise InputError(f"--out {shown(out)}: tables go into a folder; give its name, such as {shown(out.stem)}")
     # Results of several kinds have folders of their own.
     for place_of_kind in () if out is None else (out, out / "fit"):
         check_places([None if published is None else published.file], out=place_of_kind / "cases.csv")

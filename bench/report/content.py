@@ -214,9 +214,10 @@ def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
         return "Nothing is missing: what the equation leaves cannot be told from noise."
     if diagnosis.verdict == "unexplained":
         return "Something is missing, but nothing in the catalogue explains it."
-    names = [
+    every = [
         one.effect + (f" (or {', '.join(one.indistinguishable)})" if one.indistinguishable else "") for one in found
     ]
+    names = [f"{name} ({every.count(name)} times)" if every.count(name) > 1 else name for name in dict.fromkeys(every)]
     said = [f"What the equation lacks: {_listed(names)}."]
     rivals = [one for one in diagnosis.left if one.instead]
     if rivals:
@@ -230,10 +231,10 @@ def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
     if len(rivals) < len(diagnosis.left):
         size = "" if lost else f"; in all, the model leaves {diagnosis.residual[1]:.3g} times the noise"
         if diagnosis.residual[1] < REACHED:
-            size = "; it is small, since the model comes down to the noise"
+            size = f"; it is small: with it, the model leaves {diagnosis.residual[1]:.3g} times the noise"
         said.append(f"Something more is left that nothing in the catalogue explains{size}.")
     elif diagnosis.whole and not rivals:
-        them = "it" if len(names) == 1 else "them"
+        them = "it" if len(every) == 1 else "them"
         said.append(f"With {them}, nothing significant is left.")
     if NOT_FOLLOWED in short:
         said.append(

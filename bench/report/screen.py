@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from latticebench.bench.limit import Design, Limit
     from latticebench.methods.method import Fit
 
+# Lines of what is said of a bound's noise, at most.
+MOST_LINES = 10
 MEANINGS = {"e2": "relative error of the coefficients, median over seeds"}
 
 
@@ -27,8 +29,13 @@ def console() -> Console:
     """Return the console that results are printed on."""
     from rich.console import Console
 
+    class Screen(Console):
+        def on_broken_pipe(self) -> None:
+            """Let the program end as it does when the reader of a plain print stops reading."""
+            raise BrokenPipeError
+
     # A pipe has no width: let nothing be cut off there.
-    return Console() if sys.stdout.isatty() else Console(width=200)
+    return Screen() if sys.stdout.isatty() else Screen(width=200)
 
 
 def show_rows(columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
@@ -102,12 +109,17 @@ def show_limit(
     for group in limit.groups:
         listed = "; ".join(limit.library.texts[k] for k in group)
         console().print(f"Hard to tell apart: {listed}", highlight=False, markup=False, soft_wrap=True)
+    told = note.splitlines()
+    if len(told) > MOST_LINES:
+        told = [*told[: MOST_LINES - 1], f"... and {len(told) - MOST_LINES + 1} lines more, in the JSON"]
     state = (
-        f"{note}\n{limit.samples} samples, noise level {limit.noise:.3g}; the terms' conditioning is "
+        f"{chr(10).join(told)}\n{limit.samples} samples, noise level {limit.noise:.3g}; the terms' conditioning is "
         f"{limit.conditioning:.2g}\n"
         f"All coefficients together can be known to {100 * limit.relative:.2g} % (root-mean-square of E2)."
     )
-    if design.relative <= design.target:
+    if warnings:
+        text = "What more readings would bring is told of an equation that fits."
+    elif design.relative <= design.target:
         text = f"{wanted} is within reach as things are, up to a noise level of {design.noise:.2g}."
     else:
         options = [f"a noise level of {design.noise:.2g}"]

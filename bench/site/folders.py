@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -20,6 +21,12 @@ from latticebench.systems.files import DATA, check_regular, read_json, read_text
 # What programs leave beside files.
 LEFT_OUT = ("__pycache__",)
 PNG = b"\x89PNG\r\n\x1a\n"
+# What makes an SVG more than a picture.
+ACTIVE = re.compile(
+    r"<\s*(?:\w+:)?(?:script|foreignObject|iframe|object|embed|animate|set|handler)\b|[\s\"'/]on[a-z]+\s*=\s*[\"']|javascript:|"
+    r"<!ENTITY|@import|url\(\s*[\"']?(?!#)[^\s\"'#]|href\s*=\s*[\"']?\s*(?!#|data:image/(?:png|jpeg))[^\s\"'#]",
+    re.IGNORECASE,
+)
 # A folder within a folder within ... is no folder of results.
 MOST_NESTED = 5
 MOST_FILES = 10_000
@@ -110,6 +117,8 @@ def read_folder(path: Path, parts: tuple[str, ...]) -> Folder:
     files = [one for one in files if not os.path.isdir(one)]
     for one in files:
         check_regular(one)
+        if one.suffix.lower() == ".svg":
+            check_still(one)
     by_ending = {ending: [one for one in files if one.suffix.lower() == ending] for ending in ENDINGS}
     texts = {one.stem: read_text(one) for one in by_ending[".md"]}
     diagnoses = {one.stem: read_diagnosis(one) for one in by_ending[".json"]}
@@ -128,7 +137,8 @@ def _inside(path: Path) -> list[Path]:
     """Return what a folder holds, by name.
 
     Raises:
-        InputError: it cannot be read, is empty, holds too much, or a name has signs that cannot be shown.
+        InputError: it cannot be read, is empty, holds too much, a name has signs that cannot be shown, or a link leads
+            out of the folder.
     """
     try:
         names = sorted(name for name in os.listdir(path) if not name.startswith(".") and name not in LEFT_OUT)
@@ -139,6 +149,11 @@ def _inside(path: Path) -> list[Path]:
         raise InputError(f"{shown(path)}: {held} in it; give a folder of `latticebench table DIR --out`")
     if odd := [name for name in names if name != printable(name)]:
         raise InputError(f"{shown(path / odd[0])}: a name with signs that cannot be shown; rename it")
+    own = Path(os.path.realpath(path))
+    if out := [name for name in names if own not in Path(os.path.realpath(path / name)).parents]:
+        raise InputError(
+            f"{shown(path / out[0])}: a link to what does not lie in the folder; replace it by what is to be published"
+        )
     return [path / name for name in names]
 
 
@@ -188,6 +203,18 @@ def png_size(path: Path) -> tuple[int, int]:
         raise InputError(f"{shown(path)}: not a PNG; draw it again")
     width, height = struct.unpack(">II", head[16:])
     return int(width), int(height)
+
+
+def check_still(path: Path) -> None:
+    """Make sure that a picture does nothing but show itself: a browser runs what an SVG holds.
+
+    Raises:
+        InputError: it has a script, an action or an element of another language, or loads something.
+    """
+    if found := ACTIVE.search(read_text(path, DATA)):
+        raise InputError(
+            f"{shown(path)}: {found[0].strip()[:30]!r} in it could run or load something; draw it again or leave it out"
+        )
 
 
 def value_of(cell: str) -> float:

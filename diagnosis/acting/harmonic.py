@@ -38,6 +38,10 @@ class Wave(InStep):
         function = np.cos if self.name == "cos" else np.sin
         return np.asarray((t**self.power * function(self.omega * t))[None, :, None])
 
+    def __str__(self) -> str:
+        """Return it in the term language."""
+        return f"t**{self.power}*{self.name}({self.omega!r}*t)" if self.power else f"{self.name}({self.omega!r}*t)"
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Harmonic(Placed, acts="harmonic"):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Force, Placed, Scene, times
+from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Force, Placed, Scene, joined, times
 from latticebench.systems.effects import Effect
 
 
@@ -46,7 +46,7 @@ class OneBond(AtOneSite, acts="one bond"):
 
     def sentences(self, chain: Chain) -> list[str]:
         """Return what the bond has."""
-        sum_ = " + ".join(times(value, f"({text})") for text, value in zip(self.texts, self.strength, strict=True))
+        sum_ = joined(times(value, f"({text})") for text, value in zip(self.texts, self.strength, strict=True))
         following = (self.here + 1) % chain.sites + 1
         return [f"the bond between sites {self.here + 1} and {following} alone has {sum_} besides"]
 

@@ -7,7 +7,7 @@ effect of the catalogue has in its field `acts`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -128,7 +128,10 @@ class Force:
 
 
 class InStep(ABC):
-    """A factor of time that is the same at all sites; two with the same numbers are equal."""
+    """A factor of time that is the same at all sites; two with the same numbers are equal.
+
+    As a text it is in the term language.
+    """
 
     @abstractmethod
     def __call__(self, t: ndarray) -> ndarray:
@@ -370,7 +373,7 @@ class AtOneSite(Placed):
 
     def sentences(self, chain: Chain) -> list[str]:
         """Return what the site has."""
-        sum_ = " + ".join(times(value, text) for text, value in zip(self.labels(chain), self.strength, strict=True))
+        sum_ = joined(times(value, text) for text, value in zip(self.labels(chain), self.strength, strict=True))
         return [f"site {self.here + 1} alone has {sum_} besides"]
 
 
@@ -400,6 +403,11 @@ class OfSensors(Placed):
 def times(value: float, text: str) -> str:
     """Return a coefficient times a term as text."""
     return f"{value:.{DIGITS}g}" if text == "1" else f"{value:.{DIGITS}g}*{text}"
+
+
+def joined(summands: Iterable[str]) -> str:
+    """Return a sum of what `times` returns, as text."""
+    return " + ".join(summands).replace("+ -", "- ")
 
 
 def way_of(effect: Effect) -> type[Placed]:

@@ -38,6 +38,11 @@ class Bell(InStep):
         x = (t - self.at) / self.width
         return np.asarray((x**self.power * np.exp(-(x**2) / 2))[None, :, None])
 
+    def __str__(self) -> str:
+        """Return it in the term language."""
+        x = f"((t-{self.at!r})/{abs(self.width)!r})"
+        return f"{x}**{self.power}*exp(-{x}**2/2)" if self.power else f"exp(-{x}**2/2)"
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pulse(Placed, acts="pulse"):
