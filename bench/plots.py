@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -58,6 +59,21 @@ def plot(overlay: Overlay, only: Sequence[str] = (), *, titled: bool = True, fig
     if titled:
         figure.suptitle(label(overlay.source) + rows, fontsize=10)
     return figure
+
+
+def svg(overlay: Overlay, panel: str) -> str:
+    """Draw a panel as an SVG element that is as wide as its place."""
+    import matplotlib as mpl
+
+    picture = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": panel}):
+        nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
+        plot(overlay, [panel], titled=False).savefig(picture, format="svg", transparent=True, metadata=nothing, dpi=140)
+    text = picture.getvalue()
+    text = text[text.index("<svg ") :]
+    head, _, rest = text.partition(">")
+    kept = " ".join(word for word in head.split(" ") if not word.startswith(("width=", "height=", "version=")))
+    return f"{kept}>{rest}"
 
 
 def panels(overlay: Overlay) -> dict[str, Callable[[SubFigure, Overlay], None]]:
@@ -163,6 +179,8 @@ def _telling(overlay: Overlay) -> tuple[list[int], slice]:
     count = min(len(left), MOST_SAMPLES)
     total = np.concatenate([[0.0], np.cumsum(left.sum(axis=1))])
     begin = int(np.argmax(total[count:] - total[:-count]))
+    if overlay.sites <= MOST_SITES:
+        return list(range(overlay.sites)), slice(begin, begin + count)
     worst = np.argsort(-left.sum(axis=0), kind="stable")[: MOST_SITES // 2].tolist()
     return sorted({*worst, *overlay.moving(MOST_SITES - 1 - len(worst))}), slice(begin, begin + count)
 

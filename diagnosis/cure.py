@@ -62,6 +62,8 @@ def cure(model: Model, chain: Chain) -> Cure:
 
 def _terms(placed: Placed, model: Model, chain: Chain) -> list[str] | None:
     """Return an effect as terms, one for each strength; None where no term can say it."""
+    if placed.quickened() is not None:
+        return None
     if placed.instrument or placed.other_ends():
         return []
     site = placed.scaled()

@@ -130,7 +130,7 @@ class Cause(Exhibit):
         from latticebench.bench.report.curves import curves
         from latticebench.bench.report.page import page
 
-        return page(self.report, curves(self.result))
+        return page(self.report, curves(self.result), overlay=self.overlay)
 
     @functools.cached_property
     def overlay(self) -> Overlay:

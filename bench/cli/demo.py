@@ -24,6 +24,7 @@ def demo(
     """Simulate seven pendula with a defect and a sensor that is off, and find both; takes about half a minute."""
     from latticebench.bench import calls
     from latticebench.bench import demo as made
+    from latticebench.bench.overlay import of_diagnosis
     from latticebench.bench.report.curves import curves
     from latticebench.bench.report.document import provenance
     from latticebench.bench.report.page import write_page
@@ -46,7 +47,7 @@ def demo(
     say_notes(data)
     with watching() as watcher, redirect_stdout(sys.stderr):
         found, report = calls.diagnose(data, library("declared", made.TERMS), 2, watcher=watcher)
-    write_page(report, curves(found), provenance(), page)
+    write_page(report, curves(found), provenance(), page, of_diagnosis(found))
     screen = console()
     screen.print(report.sentence, style="bold", highlight=False, markup=False, soft_wrap=True)
     for line in (report.equation.after.text, *(f"    {line}" for line in report.equation.after.elsewhere)):

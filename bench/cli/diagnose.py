@@ -133,7 +133,8 @@ def _report(
     from latticebench.systems.files import write_text
 
     about = provenance()
-    text = "" if json_out is None else to_json(diagnosis_document(report, about, of_diagnosis(found)))
+    overlay = None if json_out is None and html_out is None else of_diagnosis(found)
+    text = "" if json_out is None else to_json(diagnosis_document(report, about, overlay))
     failures: list[str] = []
     # Files first: whoever reads the screen may stop reading.
     if json_out is not None and json_out != "-":
@@ -144,7 +145,7 @@ def _report(
         from latticebench.bench.report.page import write_page
 
         with kept(failures):
-            write_page(report, curves(found), about, html_out)
+            write_page(report, curves(found), about, html_out, overlay)
     if json_out == "-":
         print(text, end="")
     else:

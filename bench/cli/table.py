@@ -46,10 +46,10 @@ def table(
     if value not in SCORES:
         raise unknown("score", value, SCORES, "--value")
     kinds.check_tables(only)
-    store = open_store(folder)
-    published = None if beside is None else read_published(beside)
     if out is not None and out.suffix.lower() in OTHERS and not out.is_dir():
         raise InputError(f"--out {shown(out)}: tables go into a folder; give its name, such as {shown(out.stem)}")
+    store = open_store(folder)
+    published = None if beside is None else read_published(beside)
     # Results of several kinds have folders of their own.
     for place_of_kind in () if out is None else (out, out / "fit"):
         check_places([None if published is None else published.file], out=place_of_kind / "cases.csv")

@@ -5,12 +5,11 @@ The template escapes every text. Markup is only what SymPy and matplotlib write,
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from latticebench.bench.overlay import Overlay
-from latticebench.bench.plots import panels, plot
+from latticebench.bench.plots import panels, svg
 from latticebench.bench.provenance import lines
 from latticebench.bench.report import rows
 from latticebench.bench.report.document import Provenance
@@ -62,21 +61,6 @@ def fit_page(
     return made.get_template("fit.html.j2").render(
         found=found, overlay=overlay, quality=quality, style=style, equation=written(found),
         columns=columns, rows=cells,
-        pictures={name: (CAPTIONS[name], _svg(overlay, name)) for name in panels(overlay)},
+        pictures={name: (CAPTIONS[name], svg(overlay, name)) for name in panels(overlay)},
         origin=[] if about is None else [line.partition(": ")[::2] for line in lines(about.model_dump())],
     )  # fmt: skip
-
-
-def _svg(overlay: Overlay, panel: str) -> str:
-    """Draw a panel as an SVG element that is as wide as its place."""
-    import matplotlib as mpl
-
-    picture = io.StringIO()
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": panel}):
-        nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
-        plot(overlay, [panel], titled=False).savefig(picture, format="svg", transparent=True, metadata=nothing, dpi=140)
-    text = picture.getvalue()
-    text = text[text.index("<svg ") :]
-    head, _, rest = text.partition(">")
-    kept = " ".join(word for word in head.split(" ") if not word.startswith(("width=", "height=", "version=")))
-    return f"{kept}>{rest}"

@@ -9,6 +9,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from latticebench.bench.plots import MAPPED, svg
 from latticebench.bench.provenance import lines
 from latticebench.bench.report import pictures, rows
 from latticebench.bench.report.content import Report
@@ -20,8 +21,12 @@ from latticebench.systems.files import write_text
 if TYPE_CHECKING:
     import jinja2
 
+    from latticebench.bench.overlay import Overlay
 
-def write_page(report: Report, curves: PictureCurves, about: Provenance | None, path: Path) -> None:
+
+def write_page(
+    report: Report, curves: PictureCurves, about: Provenance | None, path: Path, overlay: Overlay | None = None
+) -> None:
     """Write the page of a diagnosis, whole or not at all.
 
     Args:
@@ -29,20 +34,21 @@ def write_page(report: Report, curves: PictureCurves, about: Provenance | None, 
         curves: what it draws.
         about: where the diagnosis comes from.
         path: the file.
+        overlay: the readings, which are drawn first where they are given.
 
     Raises:
         InputError: it cannot be written.
     """
-    write_text(path, page(report, curves, about))
+    write_text(path, page(report, curves, about, overlay))
 
 
-def page(report: Report, curves: PictureCurves, about: Provenance | None = None) -> str:
+def page(report: Report, curves: PictureCurves, about: Provenance | None = None, overlay: Overlay | None = None) -> str:
     """Return the page of a diagnosis; the arguments are those of `write_page`."""
     frequencies = [one.parameters["omega"] for one in report.effects if "omega" in one.parameters]
     templates = environment()
     style, _, _ = templates.loader.get_source(templates, "diagnosis.css")  # type: ignore[union-attr]
     return templates.get_template("diagnosis.html.j2").render(
-        report=report, curves=curves, style=style,
+        report=report, curves=curves, style=style, readings=_readings(overlay),
         pictures=pictures.draw(curves, [float(one) for one in frequencies], report.recording.units),
         effects=rows.effects(report), coefficients=rows.coefficients(report), errors=rows.errors(report),
         modes=rows.modes(report), horizons=rows.horizons(report), left=rows.left(report),
@@ -52,6 +58,15 @@ def page(report: Report, curves: PictureCurves, about: Provenance | None = None)
         swing=1 < report.recording.sites < pictures.MAPPED,
         origin=[] if about is None else [line.partition(": ")[::2] for line in lines(about.model_dump())],
     )  # fmt: skip
+
+
+def _readings(overlay: Overlay | None) -> list[tuple[str, str, str]]:
+    """Return name, caption and picture of the readings: a map where there are sites enough, and lines."""
+    if overlay is None:
+        return []
+    names = ["map", "sites"] if overlay.sites >= MAPPED else ["sites"]
+    captions = {"map": "The readings, site against time.", "sites": "Readings, and what both equations make of them."}
+    return [(name, captions[name], svg(overlay, name)) for name in names]
 
 
 def environment() -> jinja2.Environment:

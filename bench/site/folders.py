@@ -6,6 +6,7 @@ import math
 import os
 import re
 import struct
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +22,10 @@ from latticebench.systems.files import DATA, check_regular, read_json, read_text
 # What programs leave beside files.
 LEFT_OUT = ("__pycache__",)
 PNG = b"\x89PNG\r\n\x1a\n"
-# What makes an SVG more than a picture.
-ACTIVE = re.compile(
-    r"<\s*(?:\w+:)?(?:script|foreignObject|iframe|object|embed|animate|set|handler)\b|[\s\"'/]on[a-z]+\s*=\s*[\"']|javascript:|"
-    r"<!ENTITY|@import|url\(\s*[\"']?(?!#)[^\s\"'#]|href\s*=\s*[\"']?\s*(?!#|data:image/(?:png|jpeg))[^\s\"'#]",
-    re.IGNORECASE,
-)
+# Elements and words that make an SVG more than a picture, and what it may refer to.
+ACTIVE = ("script", "foreignobject", "iframe", "object", "embed", "handler", "animate", "set", "animatemotion")
+LOADING = re.compile(r"<!ENTITY|<\?xml-stylesheet|@import|javascript:|url\(\s*[\"']?(?!#)[^\s\"'#]", re.IGNORECASE)
+OWN = re.compile(r"#|data:image/(?:png|jpeg);")
 # A folder within a folder within ... is no folder of results.
 MOST_NESTED = 5
 MOST_FILES = 10_000
@@ -206,15 +205,31 @@ def png_size(path: Path) -> tuple[int, int]:
 
 
 def check_still(path: Path) -> None:
-    """Make sure that a picture does nothing but show itself: a browser runs what an SVG holds.
+    """Make sure that an SVG does nothing but show itself: a browser runs what it holds.
 
     Raises:
-        InputError: it has a script, an action or an element of another language, or loads something.
+        InputError: it is none, or has a script, an action or an element of another language, or loads something.
     """
-    if found := ACTIVE.search(read_text(path, DATA)):
-        raise InputError(
-            f"{shown(path)}: {found[0].strip()[:30]!r} in it could run or load something; draw it again or leave it out"
-        )
+    text = read_text(path, DATA)
+    found = LOADING.search(text)
+    try:
+        wrong = found[0] if found else next(_actions(ElementTree.fromstring(text)), "")
+    except ElementTree.ParseError as error:
+        raise InputError(f"{shown(path)}: not an SVG: {error}; draw it again") from None
+    if wrong:
+        raise InputError(f"{shown(path)}: {wrong!r} in it could run or load something; draw it again, or leave it out")
+
+
+def _actions(picture: ElementTree.Element) -> Iterator[str]:
+    """Yield what an SVG could do besides showing itself."""
+    for element in picture.iter():
+        name = str(element.tag).rpartition("}")[2].lower()
+        if name in ACTIVE:
+            yield f"<{name}"
+        for key, value in element.items():
+            attribute = key.rpartition("}")[2].lower()
+            if attribute.startswith("on") or (attribute == "href" and not OWN.match(value.strip())):
+                yield f"{attribute}="
 
 
 def value_of(cell: str) -> float:

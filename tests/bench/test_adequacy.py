@@ -64,6 +64,20 @@ def test_a_network_in_a_local_minimum_is_told_whatever_it_says_of_itself():
     assert quality.warnings
 
 
+@pytest.mark.parametrize("method", ["stlsq", "sr3", "least-squares"])
+def test_terms_that_cancel_each_other_are_told_where_a_method_gives_no_standard_errors(method):
+    data = simulate(find("phi4"), sites=21, times=sample_times(50, 10.0))
+    data = observe(data, np.random.default_rng(1), noise=0.01).observed()
+    fits = {
+        name: adequacy([data], solve(make(methods.find(method), {}), [data], find(system).library(name), 2, 1))
+        for system, name in (("sine-gordon", "sines"), ("phi4", "lib2"))
+    }
+    assert not fits["sines"].fits
+    assert {"sin(u[n])", "sin(2*u[n])"} <= set(fits["sines"].unknown)
+    assert "do not determine the coefficients" in fits["sines"].warnings[0]
+    assert fits["lib2"].fits
+
+
 def test_a_whole_trajectory_with_the_wrong_equation_is_told_that_its_standard_errors_mean_nothing():
     data = pendula(defect=3.0)
     found = fitted(data, "trajectory")

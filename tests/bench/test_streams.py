@@ -34,6 +34,17 @@ def test_a_run_with_closed_streams_keeps_whole_results(closed: str, tmp_path: Pa
 
 
 @posix
+@pytest.mark.parametrize("line", ["list systems", "table store", "fit t.csv --terms 'u[n]' --order 2 --method zero"])
+def test_a_reader_that_has_seen_enough_is_no_failure(line: str, tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SUITE)
+    in_shell("$LB run s.toml --jobs 1 --results store", tmp_path)
+    (tmp_path / "t.csv").write_text("t,u1\n" + "".join(f"{k},{k % 5}\n" for k in range(20)))
+    done = in_shell(f"{{ $LB {line}; echo $? > code; }} | true", tmp_path)
+    assert (tmp_path / "code").read_text().strip() == "0"
+    assert "Traceback" not in done.stderr
+
+
+@posix
 @needs_full
 def test_a_full_standard_error_ends_no_work_and_changes_no_exit_code(tmp_path: Path) -> None:
     # What is printed there is a warning of many hours, which comes before any work.

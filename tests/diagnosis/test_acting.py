@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.diagnosis.acting import WAYS, Chain, Force, Placed
+from latticebench.diagnosis.cure import corrected, cure
 from latticebench.diagnosis.fitting import fit
 from latticebench.diagnosis.horizon import Layout, follow, linearised
 from latticebench.diagnosis.model import Model
@@ -17,6 +18,7 @@ from latticebench.diagnosis.noise import Structure
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
 from latticebench.diagnosis.score import Tangent
+from latticebench.methods.engine.dynamics import Dynamics
 from latticebench.systems.effects import CATALOGUE, HOW, Effect, find
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -272,3 +274,70 @@ def test_a_way_of_acting_that_a_user_adds_is_found_in_data_made_with_it(ramped):
     assert value == pytest.approx(-0.03, abs=4 * error)
     assert error < 0.003
     assert ageing.placed.sentences(found.after.chain)
+
+
+# As terms, and corrected readings -------------------------------------------------------------------------------------
+
+# What depends on the past or on another clock is no term of the state.
+UNSAID = ("delayed", "clock")
+MOVING = [pair for pair in EVERY_WAY if not WAYS[pair[0]].instrument and pair[0] not in (*UNSAID, "ends")]
+READING = [pair for pair in EVERY_WAY if WAYS[pair[0]].instrument and pair[0] not in (*UNSAID, "wander")]
+
+
+def forces(dynamics: Dynamics, coefficients: np.ndarray, is_complex: bool) -> np.ndarray:
+    """The right-hand side at a few states and times."""
+    draw, t = np.random.default_rng(1), np.array([0.7, 3.0, 9.1])
+    states = draw.normal(size=(len(t), dynamics.order * dynamics.parts * dynamics.count))
+    f = None if is_complex else draw.normal(size=(1, len(t), dynamics.sites))
+    return np.asarray(dynamics.linear(coefficients, t, states, f, None, derivatives=False)[0])
+
+
+@pytest.mark.parametrize(("way", "is_complex"), MOVING)
+def test_an_effect_as_terms_pushes_every_site_as_the_model_does(way: str, is_complex: bool) -> None:
+    problem = problem_of(is_complex)
+    placed = with_strength(candidate(problem, way), 0.3)
+    model = true_model(problem, placed)
+    found = cure(model, problem.chain)
+    assert found.left_out == ()
+    assert found.terms[: len(model.coefficients)] == problem.declared.texts
+    whole = model.assembled(problem.plain, problem.chain)
+    expected = forces(whole.dynamics, whole.coefficients, is_complex)
+    terms = library("cured", "; ".join(found.terms)).terms
+    again = Dynamics(terms, problem.order, is_complex, problem.chain.sites, found.ends)
+    values = forces(again, np.array([*model.coefficients, *placed.strength]), is_complex)
+    np.testing.assert_allclose(values, expected, rtol=1e-9, atol=1e-9)
+    without = true_model(problem).assembled(problem.plain, problem.chain)
+    assert np.max(np.abs(forces(without.dynamics, without.coefficients, is_complex) - expected)) > 1e-3
+
+
+@pytest.mark.parametrize(("way", "is_complex"), READING)
+def test_corrected_readings_are_those_of_an_instrument_without_the_fault(way: str, is_complex: bool) -> None:
+    problem, samples = problem_of(is_complex), recording(is_complex)
+    placed = with_strength(candidate(problem, way), 0.2)
+    fields = [samples.u] if is_complex else [samples.u, samples.v]
+    field = np.stack([np.stack([one.real, one.imag][: 1 + is_complex], axis=1) for one in fields], axis=1)
+    read = field + placed.misread(samples.t, field).added
+    parts = read[:, :, 0] + (1j * read[:, :, 1] if is_complex else 0)
+    faulty = replace(samples, u=parts[:, 0], v=None if is_complex else parts[:, 1])
+    model = Model(problem.declared, problem.order, true_model(problem).coefficients, (placed,))
+    again = corrected(model, faulty)
+    np.testing.assert_allclose(again.u, samples.u, atol=1e-9)
+    if not is_complex:
+        np.testing.assert_allclose(again.v, samples.v, atol=1e-9)
+    assert np.max(np.abs(faulty.u - samples.u)) > 1e-3
+    assert cure(model, problem.chain).terms == problem.declared.texts
+
+
+@pytest.mark.parametrize("way", UNSAID)
+def test_what_no_term_can_say_is_told_by_its_name(way: str) -> None:
+    problem = problem_of(False)
+    placed = with_strength(candidate(problem, way), 0.3)
+    found = cure(true_model(problem, placed), problem.chain)
+    assert found.left_out == (placed.effect.name,)
+    assert found.terms == problem.declared.texts
+
+
+def test_other_ends_are_those_of_the_cured_equation() -> None:
+    problem = problem_of(False)
+    placed = candidate(problem, "ends")
+    assert cure(true_model(problem, placed), problem.chain).ends == placed.other_ends() != problem.chain.ends

@@ -21,7 +21,7 @@ from latticebench.systems.files import (
     whole,
     write_text,
 )
-from latticebench.systems.toml import read_toml
+from latticebench.systems.toml import DEEPEST, read_toml
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pipes and devices as POSIX has them")
 
@@ -103,6 +103,26 @@ def test_an_output_is_neither_an_input_nor_another_output(tmp_path: Path) -> Non
         check_outputs({"--json": tmp_path / "out", "--html": tmp_path / "." / "out"})
     check_outputs({"--json": tmp_path / "new" / "deep" / "out", "--html": None}, [tmp_path / "in.csv"])
     assert [one.name for one in tmp_path.iterdir()] == ["in.csv"]
+
+
+def test_an_output_lies_in_no_folder_that_is_read(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "a.csv").write_text("x")
+    (tmp_path / "link").symlink_to("data")
+    for name in ("data/a.csv", "data/new/b.json", "link/a.csv"):
+        with pytest.raises(InputError, match=r"--json .*: it lies in .*data, which the same command reads"):
+            check_outputs({"--json": tmp_path / name}, [tmp_path / "data"])
+    check_outputs({"--json": tmp_path / "data.json"}, [tmp_path / "data"])
+
+
+def test_tables_within_tables_are_read_to_a_depth_that_functions_can_walk_through(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("\ufeff" + ".".join("a" * (DEEPEST - 1)) + " = 1\n")
+    assert read_toml(path)
+    for content in (".".join("a" * 3000) + " = 1", f"[{'.'.join('a' * 3000)}]", "a = " + "[" * 90 + "]" * 90):
+        path.write_text(content)
+        with pytest.raises(InputError, match=r"a\.toml: not TOML: it is nested too deeply"):
+            read_toml(path)
 
 
 def test_a_link_is_kept_and_an_interrupted_write_leaves_what_it_leads_to(tmp_path: Path) -> None:

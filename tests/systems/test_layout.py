@@ -161,6 +161,15 @@ def test_a_spreadsheet_is_read_as_the_table_that_it_holds(tmp_path):
         read(tmp_path / "a.xlsx")
 
 
+def test_a_formula_without_a_value_is_no_gap(tmp_path):
+    book = openpyxl.Workbook()
+    for row in (["t", "u1"], [0, 1.5], [1, None], [2, "=B2*2"]):
+        book.active.append(row)
+    book.save(tmp_path / "a.xlsx")
+    with pytest.raises(InputError, match="row 4, column 2: a formula whose value is not in the file"):
+        read(tmp_path / "a.xlsx")
+
+
 def test_of_a_workbook_the_sheet_with_the_times_is_read(tmp_path):
     book = openpyxl.Workbook()
     book.active.title = "Notes"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -15,12 +16,16 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from commandline import refused
+from commandline import refused, succeed
 from latticebench.bench.colours import series
-from latticebench.bench.overlay import Overlay
+from latticebench.bench.figures import save
+from latticebench.bench.overlay import Overlay, of_recording
+from latticebench.bench.plots import plot
 from latticebench.bench.report.shown import Shown
 from latticebench.bench.site.build import MANIFEST, build
+from latticebench.bench.site.folders import check_still
 from latticebench.bench.site.pages import number
+from latticebench.systems.samples import Samples
 
 RESULTS = Path(__file__).parents[3] / "results"
 HERE = {"command": "latticebench publish"}
@@ -208,6 +213,12 @@ def test_a_number_is_written_with_three_digits(cell: str, shown: str) -> None:
         ("one.png", "no picture", "not a PNG"),
         ("a\nb.csv", "a\n1\n", "signs that cannot be shown"),
         (".hidden", "", "there is nothing in it"),
+        ("a.svg", '<svg xmlns="http://www.w3.org/2000/svg"><script>alert(1)</script></svg>', "could run or load"),
+        ("a.svg", "<svg xmlns='http://www.w3.org/2000/svg' onload='alert(1)'/>", "could run or load"),
+        ("a.svg", '<svg><image href="http://x.org/a.png"/></svg>', "could run or load"),
+        ("a.svg", '<svg><a href="javascript:alert(1)">x</a></svg>', "could run or load"),
+        ("a.svg", "<svg><g></svg>", "not an SVG"),
+        ("a.svg", "<svg><style>@import url(//x.org/a.css)</style></svg>", "could run or load"),
     ],
 )  # fmt: skip
 def test_a_damaged_folder_is_refused_in_one_line_and_nothing_is_written(
@@ -220,6 +231,26 @@ def test_a_damaged_folder_is_refused_in_one_line_and_nothing_is_written(
     assert told in line
     assert str(folder) in line
     assert not (tmp_path / "site").exists()
+
+
+def test_pictures_of_this_program_are_only_pictures(tmp_path: Path) -> None:
+    t = np.arange(20.0)
+    drawn = plot(of_recording(Samples(t, np.cos(np.multiply.outer(t, [1.0, 2.0, 3.0, 4.0, 5.0])))))
+    check_still(save(drawn, tmp_path / "a.svg", {"command": "one = 'two'"}))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="makes links")
+def test_what_a_link_leads_to_outside_of_the_folder_is_not_published(tmp_path: Path, published: Path) -> None:
+    shutil.copytree(published, tmp_path / "mine")
+    (tmp_path / "secret.txt").write_text("secret")
+    (tmp_path / "mine" / "here.csv").symlink_to(min(tmp_path.glob("mine/*.csv")).name)
+    succeed("publish", "mine", "--out", "site", cwd=tmp_path)
+    for target in ("../secret.txt", tmp_path / "secret.txt"):
+        (tmp_path / "mine" / "z.md").symlink_to(target)
+        assert "z.md: a link to what does not lie in the folder" in refused(
+            "publish", "mine", "--out", "site", cwd=tmp_path
+        )
+        (tmp_path / "mine" / "z.md").unlink()
 
 
 def test_what_is_no_folder_of_results_is_refused(tmp_path: Path, published: Path) -> None:
