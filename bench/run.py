@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import logging
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -19,7 +20,10 @@ from latticebench.bench.pool import Turn
 from latticebench.bench.presence import Presence
 from latticebench.bench.store import WHOLE, Results, Shard, Store
 from latticebench.bench.suite import Suite
+from latticebench.bench.worker import MAX_REASON, one_line
 from latticebench.methods.method import make
+
+log = logging.getLogger(__name__)
 
 
 class Watcher(Protocol):
@@ -83,6 +87,7 @@ def run(
     wanted = dict(itertools.islice(zip(keys.values(), suite.cases, strict=True), shard.first - 1, None, shard.step))
     waiting = [case for key, case in wanted.items() if key not in before or not counts(case, *before[key], retry)]
     tally = Tally(reused=len(wanted) - len(waiting))
+    log.info("%d of %d cases to run, kept in %s", len(waiting), len(wanted), store.path)
     if watcher is not None:
         watcher.count(len(waiting))
     if waiting:
@@ -126,6 +131,7 @@ class _Ledger:
                 if self.watcher is not None:
                     self.watcher.found()
                 return "done"
+        log.debug("%s: begins%s", case.title, f" at {where}" if where else "")
         self.presence.started(case, where)
         if self.watcher is not None:
             self.watcher.started(case)
@@ -135,6 +141,11 @@ class _Ledger:
         """Keep a result; its lease ends with it."""
         self.store.put(self.keys[case.identity], case, result, made)
         self.tally.ran += 1
+        good = result["status"] in ("ok", "skipped")
+        log.log(
+            logging.INFO if good else logging.WARNING, "%s: %s %s", case.title, result["status"],
+            one_line(str(result["reason"]), MAX_REASON),
+        )  # fmt: skip
         self.presence.finished(case, result)
         if self.watcher is not None:
             self.watcher.finished(case, result)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
@@ -43,6 +44,7 @@ NOT_REACHED, NOT_FOLLOWED = "the readings are not reached", "the recording is fo
 SPARE = 10
 # Bytes for each row and each pair of numbers of a state, at least: a fit has some two dozen derivatives by the start.
 MOTIONS = 200
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +167,7 @@ def diagnose(
         problem = Problem.of(declared, order, shown, catalogue)
         _check_enough(problem)
         _check_room(problem)
-        search = Search(problem, watcher or (lambda _: None))
+        search = Search(problem, functools.partial(_say, data[0].source, watcher))
         found = None
 
         # Models are forecast once, to be named and to be reported.
@@ -195,6 +197,13 @@ def diagnose(
 
 def _none_equal(found: Found) -> tuple[tuple[str, ...], ...]:
     return ((),) * len(found.models[0].model.effects)
+
+
+def _say(source: str, watcher: Watcher | None, text: str) -> None:
+    """Tell what is being done, to the log and to a watcher."""
+    log.info("%s: %s", source, text)
+    if watcher is not None:
+        watcher(text)
 
 
 def _check_enough(problem: Problem) -> None:

@@ -19,6 +19,7 @@ Names with a leading underscore, and those of the rooms that are not described i
 from __future__ import annotations
 
 import importlib
+import logging
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from latticebench.front import Bound, Cause, Run, Tables, diagnose, limit, results, run
     from latticebench.pictures import Film, Picture, Survey
     from latticebench.recording import Inspected, Model, Recording, read, simulate, system
+
+# What is done is told to `logging` under the name of the module that does it; nobody hears it who has not asked.
+logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 ROOMS = ("systems", "methods", "diagnosis", "bench")
 # In which module of this package a name lies.

@@ -86,7 +86,7 @@ def bag(regression: Regression, threshold: float, models: int, dropped: int, see
 
 @dataclass(frozen=True)
 class ESINDy(Differentiating):
-    """pysindy's ensemble of STLSQ; see the module.
+    """pysindy's STLSQ on bags of rows and of terms, tuned on the samples; see the module.
 
     Attributes:
         thresholds: shares of the derivative's RMS (dimensionless) to choose from.

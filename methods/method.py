@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import logging
 import numbers
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 # Characters of what a method says of its fit.
 MOST_SAID = 2000
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -245,6 +247,7 @@ def solve(method: Method, data: Sequence[Samples], library: Library, order: int,
     shown = [s.observed() if isinstance(s, SimulatedSamples) and not method.abilities.truth else s for s in data]
     for package in (*method.abilities.loads, *method.abilities.needs):
         importlib.import_module(package)
+    log.debug("%s: fits %d terms to %d trajectories", method.name, len(library.terms), len(shown))
     wall, cpu = time.perf_counter(), time.process_time()
     fit = method.fit(shown, library, order, seed)
     _check_returned(fit, library, order)

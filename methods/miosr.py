@@ -57,7 +57,7 @@ def best_subsets(regression: Regression, patience: float, seed: int) -> list[Flo
 
 @dataclass(frozen=True)
 class MIOSR(Differentiating):
-    """pysindy's MIOSR; see the module.
+    """pysindy's mixed-integer regression (MIOSR), tuned on the samples; see the module.
 
     Attributes:
         patience: seconds after which the solver's best support of one number of terms is taken, proven or not.

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PIELM:
-    """A network with its output layer and coefficients solved by least squares; see the module.
+    """A network whose hidden units are drawn, solved by least squares; see the module.
 
     Attributes:
         width: number of tanh units.

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PINN:
-    """The paper's network; see the module for its loss.
+    """The paper's network, trained by Adam and then L-BFGS; see the module for its loss.
 
     Attributes:
         layers: number of hidden layers (the paper's 3).

@@ -81,7 +81,7 @@ def integrals(
 
 @dataclass(frozen=True)
 class WeakSTLSQ:
-    """pysindy's weak form with its STLSQ; see the module.
+    """pysindy's weak form with its STLSQ, tuned on the samples; see the module.
 
     Attributes:
         thresholds: shares of the derivative's RMS (dimensionless) to choose from.

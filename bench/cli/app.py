@@ -7,11 +7,12 @@ packages are imported inside the function, so that `--help`, `list` and tab comp
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import sys
 import warnings
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -68,6 +69,10 @@ def program(
             min=1, max=10**8, metavar="MIB", help="Read files up to this size; 512 of data, 16 of texts if not given."
         ),
     ] = None,
+    log: Annotated[
+        Literal["debug", "info", "warning"] | None,
+        typer.Option(metavar="LEVEL", help="Tell on standard error what is done: debug, info or warning."),
+    ] = None,
 ) -> None:
     """Find the equations of motion of nonlinear lattices from data, and measure how well each method does it."""
     try:
@@ -77,6 +82,11 @@ def program(
     if largest_file is not None:
         # The environment, since worker processes read files, too.
         os.environ[LARGEST] = str(largest_file)
+    if log is not None:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logging.getLogger("latticebench").addHandler(handler)
+        logging.getLogger("latticebench").setLevel(log.upper())
 
 
 app.command("list", epilog=listing.EPILOG)(listing.list_)

@@ -101,7 +101,7 @@ def _method_rows() -> list[dict[str, Any]]:
             continue
         # JSON has lists alone.
         values = {key: list(value) if isinstance(value, tuple) else value for key, value in settings(kind).items()}
-        about = (kind.__doc__ or "").strip().splitlines()[0]
+        about = (kind.__doc__ or "").strip().splitlines()[0].partition("; ")[0].removesuffix(".")
         rows.append({"name": name, "what it is": about, "settings": values})
     taken = packages.hidden(packages.METHODS, methods.registered())
     return [*rows, *({"name": name, "what it is": why, "settings": {}} for name, why in taken.items())]

@@ -103,3 +103,16 @@ def test_a_working_folder_that_is_gone_is_told_in_one_line(tmp_path: Path) -> No
     assert done.stderr.count("\n") == 1
     assert content(tmp_path) == before
     assert in_shell("mkdir gone; cd gone; rmdir ../gone; $LB --version", tmp_path).returncode == 0
+
+
+@posix
+def test_what_is_done_is_told_to_who_asks_for_it(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(SUITE)
+    quiet = in_shell("$LB run s.toml --jobs 1 --results quiet", tmp_path)
+    told = in_shell("$LB --log info run s.toml --jobs 1 --results told", tmp_path)
+    assert "latticebench.bench.run" not in quiet.stderr
+    lines = [line for line in told.stderr.splitlines() if "INFO latticebench.bench.run: " in line]
+    assert "4 of 4 cases to run, kept in told/results.sqlite" in lines[0]
+    assert sum(": ok" in line for line in lines) == 4
+    assert "4 cases (4 ok); 4 run now" in told.stdout
+    assert in_shell("$LB --log loud run s.toml", tmp_path).returncode == 2
