@@ -364,8 +364,8 @@ def run(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     found = run("tiny", only=["phi4 noise*"], methods=["stlsq"], folder=folder)
         ...     table = found.table()
-        >>> table[["case", "status"]].to_string(index=False, header=False)
-        'phi4 noise=0.01 | lib2 | stlsq | seed 1 ok'
+        >>> table[["library", "method", "noise", "seed", "status"]].to_string(index=False, header=False)
+        'lib2 stlsq 0.01 1 ok'
     """
     from latticebench.bench.choice import chosen
     from latticebench.bench.run import run as run_suite

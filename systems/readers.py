@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 import re
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from latticebench.systems.arrays import IN_MEMORY
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import DATA, check_regular, reading, shown
 from latticebench.systems.folders import ZARR, files_in, partition, zarr_arrays
-from latticebench.systems.layout import UNITS, Layout, choose, listing, quoted
+from latticebench.systems.layout import UNITS, Layout, choose, quoted
+from latticebench.systems.npz import ARRAYS, check_names, read_npz
 from latticebench.systems.ordering import averaged, in_order, unwrapped
 from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
 FORMATS = (".csv", ".npz", ".parquet")
 OTHERS = (".txt", ".tsv", ".dat", ".xlsx")
 PLAIN = Layout()
-ARRAYS = ("t", "u", "v", "f", "trajectory")
 
 
 def read(path: Path, ends: Ends = "unknown", layout: Layout = PLAIN) -> list[Samples]:
@@ -64,7 +62,7 @@ def read(path: Path, ends: Ends = "unknown", layout: Layout = PLAIN) -> list[Sam
     source = shown(path)
     match path.suffix.lower():
         case ".npz":
-            return _from_arrays(_read_npz(path), source, ends, layout)
+            return _from_arrays(read_npz(path), source, ends, layout)
         case ".parquet":
             return _from_table(_read_parquet(path, layout), source, ends, layout)
         case ".xlsx":
@@ -89,7 +87,7 @@ def _from_folder(folder: Path, ends: Ends, layout: Layout) -> list[Samples]:
     """Return the trajectories of a Zarr store, of a Parquet table in parts, or of all files in a folder."""
     if folder.suffix.lower() == ZARR:
         arrays = zarr_arrays(folder, ARRAYS)
-        _check_names(list(arrays), shown(folder))
+        check_names(list(arrays), shown(folder))
         return _from_arrays(arrays, shown(folder), ends, layout)
     files = files_in(folder)
     if folder.suffix.lower() == ".parquet":
@@ -305,11 +303,9 @@ def _with_seconds(body: pandas.DataFrame, time: str, source: str) -> tuple[panda
     return body.assign(**{time: since}), f"times are seconds after the first row, {body[time].iloc[0]}"
 
 
-# As in tables, hours may pass a day.
-# Characters of what a library says of a damaged file.
-MOST_REASON = 200
 # A date as it is not read, since nobody knows which number is the month.
 DATE = re.compile(r"\d{1,2}[./-]\d{1,2}[./-]\d{2,4}", re.ASCII)
+# As in tables, hours may pass a day.
 CLOCK = r"\d{1,2}:[0-5]\d(:[0-5]\d(\.\d*)?)?"
 NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)|nan", re.ASCII | re.IGNORECASE)
 
@@ -367,82 +363,7 @@ def _as_floats(column: Any, name: str, path: Path) -> ndarray:
     return found
 
 
-# NPZ
-
-
-def _read_npz(path: Path) -> dict[str, ndarray]:
-    """Return the arrays, whose names, types and sizes are looked at before they are unpacked."""
-    try:
-        with reading(path, DATA) as handle:
-            if handle.peek(1)[:1] != b"P":  # type: ignore[attr-defined]
-                np.load(handle, allow_pickle=False)
-                raise ValueError("it holds one array without a name")
-            with zipfile.ZipFile(handle) as archive:
-                members = {one.filename.removesuffix(".npy"): one for one in archive.infolist()}
-                if len(members) < len(archive.infolist()):
-                    raise ValueError("an array occurs twice")
-                _check_names(list(members), shown(path))
-                shapes = {name: _shape(archive, one, name, path) for name, one in members.items()}
-                check_count(sum(int(np.prod(shape, dtype=object)) for shape in shapes.values()), path)
-                return {name: _array(archive, one, path) for name, one in members.items()}
-    except InputError:
-        raise
-    # A damaged archive fails in many ways: zipfile's, zlib's, NumPy's.
-    except Exception as error:
-        reason = str(error).partition("\n")[0][:MOST_REASON]
-        if "pickle" in str(error).lower():
-            reason = "it holds pickled objects, which are never loaded"
-        elif "object at 0x" in reason:
-            reason = "the head of an array is damaged"
-        raise InputError(
-            f"{shown(path)}: not an NPZ file of plain arrays: {reason}; write it with numpy.savez(path, t=t, u=u)"
-        ) from None
-
-
-def _shape(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, path: Path) -> tuple[int, ...]:
-    """Return the shape that the head of an array tells.
-
-    Raises:
-        InputError: it is no array, or one of other things than numbers.
-        ValueError: it holds objects.
-    """
-    with archive.open(member) as file:
-        if file.read(len(np.lib.format.MAGIC_PREFIX)) != np.lib.format.MAGIC_PREFIX:
-            raise InputError(f"{shown(path)}: {name!r} is not an array; write it with numpy.savez(path, t=t, u=u)")
-    with archive.open(member) as file:
-        version = np.lib.format.read_magic(file)
-        head: Any = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, kind = head(file)
-    if kind.hasobject:
-        raise ValueError("pickled objects")
-    if kind.kind not in ("fiuc" if name != "trajectory" else "fiuU") or kind.itemsize > 1000:
-        raise InputError(f"{shown(path)}: array {name}: its values are {kind}, not numbers")
-    return tuple(shape)
-
-
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, path: Path) -> ndarray:
-    """Return an array; a large one that is not compressed is mapped, and so read where it is looked at."""
-    if member.compress_type == zipfile.ZIP_STORED and member.file_size > IN_MEMORY:
-        return _mapped(member, path)
-    with archive.open(member) as file:
-        found: ndarray = np.lib.format.read_array(file, allow_pickle=False)
-        return found
-
-
-def _mapped(member: zipfile.ZipInfo, path: Path) -> ndarray:
-    """Return an array that stands in an archive as it is; what is written to it never reaches the file.
-
-    Raises:
-        ValueError: it is not all there.
-    """
-    with path.open("rb") as file:
-        # The head of a member ends with its name and what else is told of it, whose lengths stand at 26.
-        file.seek(member.header_offset + 26)
-        file.seek(int.from_bytes(file.read(2), "little") + int.from_bytes(file.read(2), "little"), os.SEEK_CUR)
-        version = np.lib.format.read_magic(file)
-        head: Any = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, transposed, kind = head(file)
-        return np.memmap(path, kind, "c", file.tell(), shape, "F" if transposed else "C")
+# Arrays
 
 
 def from_arrays(
@@ -484,16 +405,6 @@ def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends, layout: La
     origin = Origin(time="s" if layout.time_unit else "", unit=layout.unit, scale=layout.factor, becomes=becomes)
     told = _Told(source, ends, origin, layout=layout)
     return _trajectories({"t": t.astype(float), "u": u, "v": v, "f": f}, labels, told)
-
-
-def _check_names(names: Sequence[str], source: str) -> None:
-    """Refuse missing and unknown arrays."""
-    for name in ("t", "u"):
-        if name not in names:
-            raise InputError(f"{source}: the array {name!r} is missing; there are: {listing(names)}")
-    for name in names:
-        if name not in ARRAYS:
-            raise InputError(f"{source}: unknown array {quoted(name)}; known: {', '.join(ARRAYS)}")
 
 
 def _check_times(t: ndarray, source: str) -> None:

@@ -94,11 +94,11 @@ def check_places(inputs: Iterable[Path | str | None], **outputs: Path | str | No
 
     read = [Path(code_file(one) or one if isinstance(one, str) else one) for one in inputs if one is not None]
     given = {f"--{name}": Path(path) for name, path in outputs.items() if path not in (None, "-")}
+    check_outputs(given, read)
     for option, path in given.items():
         written = WRITTEN.get(option, ())
         if written and path.suffix.lower() in OTHERS and path.suffix.lower() not in written:
             raise InputError(f"{option} {shown(path)}: it writes {written[0]}; give a name that ends so")
-    check_outputs(given, read)
 
 
 SystemName = Annotated[

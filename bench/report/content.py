@@ -231,7 +231,7 @@ def _sentence(diagnosis: Diagnosis, found: tuple[AddedEffect, ...]) -> str:
     if len(rivals) < len(diagnosis.left):
         size = "" if lost else f"; in all, the model leaves {diagnosis.residual[1]:.3g} times the noise"
         if diagnosis.residual[1] < REACHED:
-            size = f"; it is small: with it, the model leaves {diagnosis.residual[1]:.3g} times the noise"
+            size = f"; it is small: in all, the model leaves {diagnosis.residual[1]:.3g} times the noise"
         said.append(f"Something more is left that nothing in the catalogue explains{size}.")
     elif diagnosis.whole and not rivals:
         them = "it" if len(every) == 1 else "them"

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from latticebench.bench.report.content import Left, Report
-from latticebench.bench.report.horizons import Candidate
-from latticebench.bench.report.modes import Mode
 from latticebench.bench.report.units import Units, of_coefficients, with_unit
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from latticebench.bench.report.content import Left, Report
+    from latticebench.bench.report.horizons import Candidate
+    from latticebench.bench.report.modes import Mode
     from latticebench.methods.method import Fit
 
 Table = tuple[list[str], list[list[str]]]

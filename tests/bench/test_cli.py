@@ -62,7 +62,7 @@ def test_a_fit_prints_its_equation_and_writes_json_in_the_order_of_the_terms(fol
     written = json.loads((folder / "fit.json").read_text())
     keys = [
         "method", "order", "coefficients", "stderr", "residual", "seconds", "status", "quality", "warnings", "units",
-        "shown",
+        "shown", "coefficient_units",
     ]  # fmt: skip
     assert list(written) == ["schema", "provenance", *keys]
     assert list(written["coefficients"]) == ["u[n+1]", "u[n-1]", "u[n]", "u[n]**3"]

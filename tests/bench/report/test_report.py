@@ -145,7 +145,7 @@ def test_what_is_left_without_a_name_is_told_with_its_site(pendula: Made, capsys
     report = content(pendula(left=(left,), verdict="partly explained"))
     assert rows.left(report)[1] == [["u[n]**4", "2", "31.0", "9.5"]]
     assert "Something more is left" in report.sentence
-    assert report.sentence.endswith("; it is small, since the model comes down to the noise.")
+    assert report.sentence.endswith("; it is small: in all, the model leaves 1 times the noise.")
     assert report.partly == (SMALL,)
     show(report)
     assert "u[n]**4" in capsys.readouterr().out
