@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from latticebench.systems import arrays, readers, simulate, writers
+from latticebench.systems import arrays, npz, readers, simulate, writers
 from latticebench.systems.arrays import empty, pieces
 from latticebench.systems.errors import InputError
 from latticebench.systems.samples import Samples
@@ -17,7 +17,7 @@ T, U, V = np.linspace(0, 1, 9), DRAW.normal(size=(9, 40)), DRAW.normal(size=(9, 
 
 @pytest.fixture
 def small_memory(monkeypatch):
-    for module in (arrays, readers, writers):
+    for module in (arrays, npz, writers):
         monkeypatch.setattr(module, "IN_MEMORY", 1000)
 
 
