@@ -11,6 +11,8 @@ memory, and keeps all results at once when the last case has ended. Seconds are 
 suite `default` both begin at the same moment, each on a core of its own, so that what else the machine does slows both.
 Trivial cases are run with and without in turns, either one first every second time, since the process that keeps their
 results needs a part of another core.
+
+In the row of commit 09a63745e6cd, the side without keeps no results and prints no table.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -42,6 +44,7 @@ from latticebench.methods.method import Skipped
 from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent
+PARTS = ("default", "trivial")
 # Trivial cases, and how often they are run.
 TRIVIAL, TIMES = 10_000, 8
 SUITE = f"""title = "trivial cases"
@@ -157,7 +160,8 @@ def told(rows: pd.DataFrame) -> str:
     slower = rows["slower"].str.removesuffix(" %").astype(float)
     error = f" +- {slower.std() / len(slower) ** 0.5:.1f}" if len(slower) > 1 else ""
     many = f"{len(slower)} pair{'s' * (len(slower) > 1)}"
-    return f"{rows['suite'].iloc[0]}: {slower.mean():.1f}{error} % slower (mean of {many})"
+    middle = f", median {slower.median():.1f} %" if len(slower) > 1 else ""
+    return f"{rows['suite'].iloc[0]}: {slower.mean():.1f}{error} % slower (mean of {many}{middle})"
 
 
 def main() -> None:
@@ -165,22 +169,27 @@ def main() -> None:
     if sys.argv[1:2] == ["--without"]:
         without(*sys.argv[2:4])
         return
-    parts, kept = sys.argv[1:] or ["default", "trivial"], Path("runs") / "walls"
+    parts, kept = sys.argv[1:] or list(PARTS), Path("runs") / "walls"
     if "default" in parts and kept.exists():
         raise SystemExit(f"{kept} is there: a run would go on from its results; move it away")
     table = pd.DataFrame([row for part in parts for row in measured(part, kept)])
     if (HERE / "walls.csv").exists():
         before = read_table(HERE / "walls.csv")
-        table = pd.concat([before[~before["suite"].isin(table["suite"])], table], ignore_index=True)
+        kept_rows = before["suite"].isin(set(PARTS) - set(table["suite"]))
+        table = pd.concat([before[kept_rows], table], ignore_index=True)
         table = table.sort_values("suite", kind="stable")
     about = {"command": " ".join(["python results/scale/walls.py", *sys.argv[1:]]), **origin()}
     write_text(HERE / "walls.csv", render(table, about, "csv"))
+    write_text(HERE / "walls.md", page(table, about))
+
+
+def page(table: pd.DataFrame, about: Mapping[str, Any]) -> str:
+    """Return the text of walls.md."""
     text = (__doc__ or "").split("are kept.\n")[1].strip()
     provenance = "".join(f"{line}\n" for line in markdown_list(lines(about)))
     shown = table.rename(columns={"with": "seconds with", "without": "seconds without"}).astype(str)
     means = "\n".join(f"- {told(rows)}" for _, rows in table.groupby("suite"))
-    page = "\n\n".join(["# What the walls around a case cost", text, means, markdown_table(shown), provenance])
-    write_text(HERE / "walls.md", page)
+    return "\n\n".join(["# What the walls around a case cost", text, means, markdown_table(shown), provenance])
 
 
 if __name__ == "__main__":
