@@ -69,7 +69,7 @@ class Picture(_Drawn):
 
     Attributes:
         overlay: what is drawn (`latticebench.bench.overlay.Overlay`).
-        only: names of panels: map, sites, residual, spectrum, phase; all that tell something if there are none.
+        only: panels: map, sites, residual, learning, spectrum, phase; all that tell something if there are none.
 
     Raises:
         InputError: there is no such panel.
