@@ -22,8 +22,9 @@ test-slow: $(READY)
 FRESH ?= $(shell date +%s)
 attacks: $(READY)
 	$(BIN)/python -m pytest tests/systems/test_damaged_files.py tests/systems/test_parser.py tests/systems/test_terms.py \
-		tests/systems/test_readers.py tests/bench/test_attacks.py tests/bench/test_commands.py tests/bench/test_escape.py \
-		tests/bench/test_full.py tests/bench/test_hostile.py tests/bench/test_killed.py tests/bench/test_odd_cells.py \
+		tests/systems/test_readers.py tests/systems/test_folders.py tests/bench/test_attacks.py \
+		tests/bench/test_commands.py tests/bench/test_escape.py tests/bench/test_full.py \
+		tests/bench/test_hostile.py tests/bench/test_killed.py tests/bench/test_odd_cells.py \
 		tests/bench/test_odd_recordings.py tests/bench/test_outputs.py tests/bench/test_streams.py \
 		--fresh $(FRESH) --hypothesis-seed $(FRESH) --benchmark-disable -n 2 --dist worksteal
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from latticebench import methods
 from latticebench.bench.case import Case, Folders, Roots, plain
-from latticebench.bench.pool import execute
+from latticebench.bench.pool import Pool
 from latticebench.methods.method import Fit, Skipped, make, solve
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library, library
@@ -83,7 +83,8 @@ def fit_apart(case: Apart, candidates: Library) -> Fit:
         InputError: it failed, passed a limit, or its process ended; the text says what it printed.
     """
     results: list[dict[str, Any]] = []
-    execute([case], Folders(), jobs=1, begin=lambda _: "run", keep=lambda _, result: results.append(result))
+    with Pool(1) as pool:
+        pool.run([case], Folders(), begin=lambda _: "run", keep=lambda _, result: results.append(result))
     (found,) = results
     if found["status"] == "skipped":
         raise Skipped(found["reason"])

@@ -29,21 +29,6 @@ TRIES = 2
 Turn = Literal["run", "done", "later"]
 
 
-def execute(
-    cases: Iterable[Case],
-    folders: Folders,
-    *,
-    jobs: int,
-    begin: Callable[[Case], Turn],
-    keep: Callable[[Case, dict[str, Any]], None],
-    pulse: Callable[[], None] = lambda: None,
-) -> None:
-    """Run cases on `jobs` workers, which end with the last case; see `Pool.run`."""
-    waiting = list(cases)
-    with Pool(max(1, min(jobs, len(waiting)))) as pool:
-        pool.run(waiting, folders, begin=begin, keep=keep, pulse=pulse)
-
-
 def foreign(case: Case) -> str:
     """Return which files of the user's with code a case runs; empty where all of its code is of this package."""
     roots = case.roots
@@ -61,7 +46,7 @@ class Pool:
         self.looked = 0.0
 
     def __enter__(self) -> Pool:
-        """Start what ends the workers should this process be killed; they start when there is work."""
+        """Start what ends the workers should this process be killed."""
         self.guardian.__enter__()
         return self
 
@@ -71,6 +56,11 @@ class Pool:
             self._close()
         finally:
             self.guardian.__exit__(kind, value, at)
+
+    def start(self, cases: Iterable[Case]) -> None:
+        """Start the workers for the first of these cases, before they are handed any: importing takes a while."""
+        for place, code in zip(range(len(self.workers)), sorted(map(foreign, cases)), strict=False):
+            self.workers[place] = Process(code, self.events, self.guardian)
 
     def run(
         self,

@@ -306,6 +306,8 @@ def _look_up(cases: Iterable[FitCase], base: Path, large: bool) -> None:
         check_fit([_blank(case, system)], candidates, system.order)
         if case.initial is not None and case.initial not in system.initials:
             raise unknown("initial state", case.initial, system.initials, f"system {system.name!r}")
+        if case.parameters:
+            system.initial_state(case.parameters, case.sites or system.sites, case.initial)
 
 
 def _blank(case: FitCase, system: System) -> Samples:

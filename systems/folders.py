@@ -115,6 +115,8 @@ def zarr_arrays(path: Path, known: Sequence[str]) -> dict[str, ndarray]:
                 f"{shown(path)}: it holds {8 * values / 2**20:.0f} MiB of numbers, at most {largest(DATA) // 2**20} "
                 f"are read; if it is meant to be so long, raise that with --largest-file or {LARGEST}"
             )
+        for name, one in arrays.items():
+            _check_whole(one, f"{shown(path)}: array {name!r}")
         return {name: _loaded(one) for name, one in arrays.items()}
     except InputError:
         raise
@@ -148,6 +150,20 @@ def _check_packing(folder: Path) -> None:
         raise InputError(f"{shown(folder)}: its values are {kind[:40]}, not numbers")
     if {"scale_factor", "add_offset"} & set(scaled):
         raise InputError(f"{shown(folder)}: its numbers are scaled (scale_factor, add_offset); write them as they are")
+
+
+def _check_whole(array: Any, where: str) -> None:
+    """Refuse an array of which chunks are not there, unless they stand for missing values.
+
+    Raises:
+        InputError: chunks are not there, and Zarr would have a number in their place.
+    """
+    lost, fill = array.nchunks - array.nchunks_initialized, array.fill_value
+    if lost > 0 and (fill is None or not np.isnan(fill)):
+        raise InputError(
+            f"{where}: {lost} of its {array.nchunks} chunks are not there, and would be read as {fill}; copy the store "
+            "again, or, if it was written so, write it with write_empty_chunks=True"
+        )
 
 
 def _codecs(given: Any) -> list[str]:
@@ -195,7 +211,8 @@ def write_zarr(arrays: Mapping[str, ndarray], path: Path) -> None:
     table = xarray.Dataset(fields, coordinates)
     with whole_folder(path) as temporary:
         encoding = {name: {"chunks": chunks} for name in fields}
-        table.to_zarr(temporary, mode="w", consolidated=False, encoding=encoding)
+        # A chunk that is not there is then one that was lost.
+        table.to_zarr(temporary, mode="w", consolidated=False, encoding=encoding, write_empty_chunks=True)
 
 
 @contextlib.contextmanager

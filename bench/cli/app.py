@@ -41,6 +41,9 @@ from latticebench.bench.threads import prefer_one_thread
 from latticebench.systems.errors import InputError, printable
 from latticebench.systems.files import LARGEST
 
+# Characters of a refusal.
+LONGEST = 2000
+
 app = typer.Typer(
     name="latticebench",
     help="Find the equations of motion of nonlinear lattices from data, and measure how well each method does it.",
@@ -151,4 +154,8 @@ def main() -> None:
 
 
 def _complain(text: str) -> None:
-    print("error: " + printable(" ".join(text.splitlines())), file=sys.stderr)
+    line = printable(" ".join(text.splitlines()))
+    # What is wrong is said first, and what to do last; between them a name of any length may have been repeated.
+    if len(line) > LONGEST:
+        line = f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
+    print(f"error: {line}", file=sys.stderr)

@@ -8,7 +8,7 @@ from typing import Any
 
 from latticebench.bench.case import Case, Folders
 from latticebench.bench.executors.executor import Ledger
-from latticebench.bench.pool import execute
+from latticebench.bench.pool import Pool
 from latticebench.bench.provenance import origin
 
 
@@ -25,8 +25,11 @@ class Local:
 
     def execute(self, cases: Sequence[Case], folders: Folders, loads: Collection[str], ledger: Ledger) -> None:
         """Run cases; see `Executor.execute`."""
-        made = origin(loads)
-        execute(
-            cases, folders, jobs=self.jobs, begin=ledger.begin, keep=lambda case, found: ledger.keep(case, found, made),
-            pulse=ledger.pulse,
-        )  # fmt: skip
+        with Pool(min(self.jobs, len(cases))) as pool:
+            pool.start(cases)
+            # The workers import meanwhile what they need.
+            made = origin(loads)
+            pool.run(
+                cases, folders, begin=ledger.begin, keep=lambda case, found: ledger.keep(case, found, made),
+                pulse=ledger.pulse,
+            )  # fmt: skip

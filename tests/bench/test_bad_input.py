@@ -173,3 +173,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_bad_input_is_one_clear_line_and_exit_code_2(command: str, folder: Path) -> None:
     with unchanged(folder):
         assert BAD_COMMANDS[command] in refused(*command.split(), cwd=folder)
+
+
+@pytest.mark.parametrize(
+    "options", [("--terms", "x" * 9000), ("--method", "m" * 9000), ("--method", "m" * 9000 + ".py")]
+)
+def test_a_name_of_any_length_is_refused_in_a_line_that_can_be_read(options: tuple[str, str], tmp_path: Path) -> None:
+    (tmp_path / "r.csv").write_text("t,u1\n0,1\n1,2\n2,3\n")
+    told = refused(
+        "fit", "r.csv", "--order", "2", *("--terms", "u[n]")[: 2 * (options[0] != "--terms")], *options, cwd=tmp_path
+    )
+    assert len(told) < 2100

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from latticebench.bench.case import Case, Folders
-from latticebench.bench.pool import TRIES, execute
+from latticebench.bench.pool import TRIES, Pool
 from latticebench.systems.errors import InputError
 
 KIND = '''
@@ -65,7 +65,8 @@ def act(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MakeAct:
 
 def run(cases: list[Case], jobs: int, begin: Callable[[Case], Any] = lambda _: "run") -> list[tuple[Case, Any]]:
     kept: list[tuple[Case, Any]] = []
-    execute(cases, Folders(), jobs=jobs, begin=begin, keep=lambda case, result: kept.append((case, result)))
+    with Pool(jobs) as pool:
+        pool.run(cases, Folders(), begin=begin, keep=lambda case, result: kept.append((case, result)))
     return kept
 
 
@@ -108,6 +109,32 @@ def test_what_has_ended_is_kept_though_the_next_case_cannot_begin(act: MakeAct) 
             raise InputError("the disk is full")
         return "run"
 
-    with pytest.raises(InputError, match="full"):
-        execute(cases, Folders(), jobs=1, begin=begin, keep=lambda case, _: kept.append(case))
+    with pytest.raises(InputError, match="full"), Pool(1) as pool:
+        pool.run(cases, Folders(), begin=begin, keep=lambda case, _: kept.append(case))
     assert kept == [cases[0]]
+
+
+def test_workers_that_were_started_beforehand_are_those_that_run_the_cases(act: MakeAct) -> None:
+    kept: list[int] = []
+    cases = [act(number=number) for number in range(4)]
+    with Pool(2) as pool:
+        pool.start(cases)
+        started = list(pool.workers)
+        pool.run(cases, Folders(), begin=lambda _: "run", keep=lambda case, _: kept.append(case.number))  # type: ignore[attr-defined]
+        assert None not in started
+        assert pool.workers == started
+    assert sorted(kept) == list(range(4))
+
+
+def test_a_worker_that_was_started_beforehand_and_is_killed_costs_no_case(act: MakeAct) -> None:
+    kept: list[str] = []
+    with Pool(1) as pool:
+        pool.start([act(number=1)])
+        (worker,) = pool.workers
+        assert worker is not None
+        worker.process.kill()
+        worker.process.wait()
+        pool.run(
+            [act(number=1)], Folders(), begin=lambda _: "run", keep=lambda _, result: kept.append(result["status"])
+        )
+    assert kept == ["ok"]

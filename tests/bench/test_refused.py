@@ -97,3 +97,11 @@ def test_keys_that_do_not_go_together_are_refused_with_their_place(tmp_path: Pat
         ('[[measured]]\nname = "x"\nfile = "x"\nterms = "u[n]"\norder = 2\n' * 2, "measured 2: name"),
     ):  # fmt: skip
         assert told in refusal(tmp_path, text), text
+
+
+def test_a_parameter_for_which_the_initial_state_is_no_number_is_refused_as_the_suite_is_loaded(tmp_path: Path) -> None:
+    head = '[methods.a]\nmethod = "zero"\n[[grid]]\nsystem = "phi4"\nlibraries = ["lib1"]\n'
+    assert refusal(tmp_path, head + "parameters = { C = [0.5, 1.0] }\n") == ""
+    told = refusal(tmp_path, head + "parameters = { C = [0.5, -1.0] }\n")
+    assert "s.toml: system 'phi4': the initial state 'kink' is not finite for C=-1" in told
+    assert "check the parameters" in told

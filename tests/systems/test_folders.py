@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import random
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from commandline import Seeds
 from latticebench.systems import folders
 from latticebench.systems.errors import InputError
 from latticebench.systems.readers import read, read_all
@@ -157,3 +161,68 @@ def test_unknown_arrays_and_folders_that_are_there_are_refused(tmp_path: Path) -
         read(tmp_path / "s.zarr")
     with pytest.raises(InputError, match="only Parquet"):
         write([trajectory()], tmp_path / "s.csv", parts=True)
+
+
+def chunks(folder: Path) -> list[Path]:
+    """The files of an array that hold its values."""
+    return [path for path in folder.rglob("*") if path.is_file() and "zarr" not in path.name]
+
+
+def test_a_chunk_of_zeros_is_written_and_one_that_is_lost_is_no_zeros(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(folders, "CHUNK", 12)
+    u = np.zeros((9, 5))
+    u[:, 4] = 1.0
+    write([Samples(np.arange(9.0), u)], tmp_path / "s.zarr")
+    same(read(tmp_path / "s.zarr")[0], Samples(np.arange(9.0), u))
+    chunks(tmp_path / "s.zarr" / "u")[0].unlink()
+    with pytest.raises(InputError, match=r"array 'u': 1 of its \d chunks are not there.*copy the store again"):
+        read(tmp_path / "s.zarr")
+
+
+def test_a_chunk_that_stands_for_missing_values_need_not_be_there(tmp_path: Path) -> None:
+    import xarray
+
+    u = np.arange(18.0).reshape(9, 2)
+    u[:, 1] = np.nan
+    table = xarray.Dataset({"u": (("t", "site"), u)}, {"t": np.arange(9.0)})
+    encoding = {"u": {"chunks": (9, 1), "fill_value": np.nan}}
+    table.to_zarr(tmp_path / "s.zarr", consolidated=False, encoding=encoding, zarr_format=3)
+    assert len(chunks(tmp_path / "s.zarr" / "u")) == 1
+    np.testing.assert_array_equal(read(tmp_path / "s.zarr")[0].u, u)
+
+
+def test_a_damaged_store_is_refused_or_read_as_it_was(tmp_path: Path, seeds: Seeds) -> None:
+    """In any of its files: a byte changed, an end cut off, a file lost or in another's place."""
+    expected = trajectory(20)
+    write([expected], tmp_path / "s.zarr")
+    files = sorted(path for path in (tmp_path / "s.zarr").rglob("*") if path.is_file())
+    for seed in seeds(40, 400):
+        draw, folder = random.Random(seed), tmp_path / "damaged.zarr"
+        shutil.copytree(tmp_path / "s.zarr", folder)
+        file = folder / draw.choice(files).relative_to(tmp_path / "s.zarr")
+        content = bytearray(file.read_bytes())
+        match draw.choice(("flip", "cut", "lose", "swap", "number")):
+            case "flip":
+                content[draw.randrange(len(content))] ^= 1 << draw.randrange(8)
+                file.write_bytes(content)
+            case "cut":
+                file.write_bytes(content[: draw.randrange(len(content))])
+            case "lose":
+                file.unlink()
+            case "swap":
+                file.write_bytes(draw.choice(files).read_bytes())
+            case "number":
+                file.write_bytes(
+                    re.sub(rb"\d+", draw.choice((b"0", b"-1", b"7", b"9999999999", b"null")), content, count=1)
+                )
+        try:
+            (found,) = read(folder)
+        except InputError as error:
+            told = str(error)
+            assert told.startswith(str(folder)), (seed, told)
+            assert "\n" not in told
+        else:
+            assert found.u.shape == expected.u.shape, seed
+        shutil.rmtree(folder)
