@@ -18,10 +18,11 @@ from collections import deque
 from queue import SimpleQueue
 from typing import Any
 
+from latticebench.bench import cgroup
 from latticebench.bench.case import STATUSES, Case, Folders
 from latticebench.bench.guardian import Guardian, search_path
 from latticebench.bench.threads import ONE_THREAD
-from latticebench.bench.tree import MARK, descendants, end, resident_mib
+from latticebench.bench.tree import MARK, end, resident_mib, started
 from latticebench.bench.worker import LENGTH, MOST_BYTES, one_line, outcome, too_much
 
 # Nothing is imported from the working folder.
@@ -61,6 +62,8 @@ class Process:
             env={**os.environ, **ONE_THREAD, MARK: self.mark}, start_new_session=True,
         )  # fmt: skip
         written.close()
+        # It has no case yet, and so has started nothing.
+        cgroup.enter(self.process.pid, self.mark)
         self.guardian = guardian
         guardian.watch_over(self.process.pid, self.mark)
         self.listener = threading.Thread(target=self._listen, args=(events,), daemon=True)
@@ -137,7 +140,7 @@ class Process:
         if time.monotonic() - self.since > limit:
             what = f"no result within the time limit of {limit:g} s" if self.begun else "the worker did not start"
             return self._finish(outcome(case, "timeout" if self.begun else "died", what))
-        if resident_mib(self.process.pid, whole=bool(self.code)) > case.memory_limit:
+        if resident_mib(self.process.pid, self.mark, whole=bool(self.code)) > case.memory_limit:
             return self._finish(outcome(case, "memory", too_much(case)))
         if self.printed.seek(0, os.SEEK_END) > MOST_PRINTED:
             self.kept, self.place = self._tail(None), 0
@@ -159,7 +162,7 @@ class Process:
         text = self._tail(printed) if self.code or result["status"] not in ("ok", "skipped") else ""
         if text:
             result["reason"] = f"{result['reason']}; " * bool(result["reason"]) + f"printed: {text}"
-        if self.code and not (keep and result["status"] == "ok" and not descendants(self.process.pid)):
+        if self.code and not (keep and result["status"] == "ok" and not started(self.process.pid, self.mark)):
             keep = False
         now = time.monotonic()
         self.quick = now - self.since < QUICK

@@ -1,7 +1,8 @@
-"""The processes that descend from a worker: how much memory they take, and how to end them all.
+"""The processes that a worker has started: how much memory they take, and how to end them all.
 
 A worker leads a session of its own, and carries a mark in its environment that its children inherit. On Linux it also
-adopts what its descendants leave behind, so that one that has detached itself is still found below it.
+adopts what its descendants leave behind, so that one that has detached itself is still found below it, and has a
+control group where it can (`bench.cgroup`).
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import time
 from collections.abc import Callable
 
 import psutil
+
+from latticebench.bench import cgroup
 
 # The mark: an environment variable with a text of the worker's own.
 MARK = "LATTICEBENCH_WORKER"
@@ -30,24 +33,33 @@ def adopt_orphans() -> None:
         ctypes.CDLL(None).prctl(ADOPT_ORPHANS, 1, 0, 0, 0)
 
 
-def descendants(process: int) -> list[psutil.Process]:
-    """Return what descends from a process and is alive."""
-    try:
-        return [one for one in psutil.Process(process).children(recursive=True) if _alive(one)]
-    except psutil.Error:
-        return []
-
-
-def resident_mib(process: int, *, whole: bool) -> float:
-    """Return the memory of a process in MiB.
+def started(process: int, mark: str) -> list[psutil.Process]:
+    """Return what a worker has started and is alive: what descends from it, and what is in its control group.
 
     Args:
         process: its number.
-        whole: with all that descends from it; what several of them share counts once, where the system knows (Linux).
+        mark: its mark.
+    """
+    found: set[psutil.Process] = set()
+    with contextlib.suppress(psutil.Error):
+        found.update(psutil.Process(process).children(recursive=True))
+    for number in cgroup.members(mark):
+        with contextlib.suppress(psutil.Error):
+            found.add(psutil.Process(number))
+    return [one for one in found if one.pid != process and _alive(one)]
+
+
+def resident_mib(process: int, mark: str, *, whole: bool) -> float:
+    """Return the memory of a worker in MiB.
+
+    Args:
+        process: its number.
+        mark: its mark.
+        whole: with all that it has started; what several of them share counts once, where the system knows (Linux).
     """
     try:
         lone = psutil.Process(process)
-        others = descendants(process) if whole else []
+        others = started(process, mark) if whole else []
         if not others:
             return float(lone.memory_info().rss) / 2**20
     except psutil.Error:
@@ -62,13 +74,14 @@ def end(process: int, mark: str) -> None:
         process: its number; it may have ended before.
         mark: its mark.
     """
+    cgroup.end(mark)
     with contextlib.suppress(psutil.Error):
         leader = psutil.Process(process)
         # Its number may be another process's by now.
         if _marked(leader, process, mark):
             # While it is held it adopts, and makes no more itself.
             leader.suspend()
-            _end_all(lambda: descendants(process))
+            _end_all(lambda: started(process, mark))
             leader.kill()
     _end_all(lambda: [one for one in psutil.process_iter() if _marked(one, process, mark)])
 
