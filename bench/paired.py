@@ -92,6 +92,11 @@ def _share(sums: Int[ndarray, " case"]) -> float:
     return float(min(np.sum(chances[np.abs(values) >= seen]), 1.0))
 
 
+def least_p(cases: int) -> float:
+    """Return the smallest p that so many cases can have, where one method is better in each of them."""
+    return min(float(2.0 ** (1 - cases)), 1.0)
+
+
 def holm(p: Sequence[float]) -> Float[ndarray, " test"]:
     """Return p values corrected for their number: the k-th smallest of m is multiplied by m + 1 - k, in order."""
     values = np.asarray(p, dtype=float)

@@ -4,7 +4,8 @@ For notebooks, each loaded when it is first used:
 
 - `read` or `simulate` a recording, look at it (`plot`, `animate`), `Model` an equation or take that of a `system`;
 - `fit` its coefficients, `diagnose` what it lacks, know the `limit` of what can be known;
-- `run` a suite of the benchmark, look at published `results`.
+- `run` a suite of the benchmark, look at published `results`;
+- whatever was given wrongly raises `InputError`, whose text says what, where, and what to do.
 
 Four rooms, each importing only from those above it in this list:
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from latticebench.front import Bound, Cause, Run, Tables, diagnose, limit, results, run
     from latticebench.pictures import Film, Picture, Survey
     from latticebench.recording import Inspected, Model, Recording, read, simulate, system
+    from latticebench.systems.errors import InputError
 
 # What is done is told to `logging` under the name of the module that does it; nobody hears it who has not asked.
 logging.getLogger(__name__).addHandler(logging.NullHandler())
@@ -34,6 +36,7 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 ROOMS = ("systems", "methods", "diagnosis", "bench")
 # In which module of this package a name lies.
 PLACES = {
+    "InputError": "systems.errors",
     "Inspected": "recording", "Model": "recording", "Recording": "recording", "read": "recording",
     "simulate": "recording", "system": "recording",
     "Fitted": "fitted", "Residual": "fitted", "fit": "fitted", "Film": "pictures", "Picture": "pictures",
@@ -43,9 +46,9 @@ PLACES = {
 }  # fmt: skip
 
 __all__ = [
-    "Bound", "Cause", "Film", "Fitted", "Inspected", "Model", "Picture", "Recording", "Residual", "Run", "Survey",
-    "Tables", "__version__", "bench", "diagnose", "diagnosis", "fit", "limit", "methods", "read", "results", "run",
-    "simulate", "system", "systems",
+    "Bound", "Cause", "Film", "Fitted", "InputError", "Inspected", "Model", "Picture", "Recording", "Residual", "Run",
+    "Survey", "Tables", "__version__", "bench", "diagnose", "diagnosis", "fit", "limit", "methods", "read", "results",
+    "run", "simulate", "system", "systems",
 ]  # fmt: skip
 
 

@@ -136,6 +136,7 @@ def _compare_methods(run: Path, reference: str, beside: Path | None, out: Path |
 
 
 def _show(found: Contest) -> None:
+    from latticebench.bench.paired import LEVEL, least_p
     from latticebench.bench.publish import readable
     from latticebench.bench.report.screen import show_note, show_rows
 
@@ -143,6 +144,9 @@ def _show(found: Contest) -> None:
     show_rows(list(rows.columns), rows.to_numpy().tolist())
     show_note("per case: E2 smaller, larger, not told apart; ratio of E2, median over the cases with its 95 % interval")
     show_note(f"p: signed-rank test over the cases, corrected for {len(found.methods)} methods (Holm)")
+    for cases in sorted(found.methods["cases"].unique()):
+        if least_p(cases) > LEVEL:
+            show_note(f"{cases} cases cannot tell two methods apart: p is {least_p(cases):.2g} at the least; six can")
     if found.ranks is None:
         show_note("no mean ranks: they need three methods and two cases that all of them have")
         return

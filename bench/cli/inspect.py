@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from latticebench.bench.cli.options import JsonOut, SystemOption, Terms, check_places, place
+from latticebench.bench.cli.options import JsonOut, Order, SystemOption, Terms, check_places, place
 from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, TimeScale, Turn, layout_of
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ def inspect(
     files: Files,
     system: SystemOption = None,
     terms: Terms = None,
+    order: Order = None,
     time: Time = None,
     columns: Columns = None,
     scale: Scale = "1",
@@ -54,7 +55,7 @@ def inspect(
     check_places([*files, system], json=json_out, out=out)
     if out is not None and out.suffix.lower() not in PICTURES:
         raise unknown("ending", out.suffix, PICTURES, f"--out {out}")
-    declared = _terms(system, terms)
+    declared = _terms(system, terms, order)
     data = read_all(files, "unknown", layout_of(time, columns, scale, sort, turn, time_scale))
     found = [look(one, declared) for one in data]
     failures: list[str] = []
@@ -79,13 +80,13 @@ def inspect(
         raise InputError("; ".join(failures))
 
 
-def _terms(system: str | None, terms: str | None) -> Library | None:
-    """Return the terms that the readings are for; None where none are given."""
+def _terms(system: str | None, terms: str | None, order: int | None) -> Library | None:
+    """Return the terms that the readings are for, of which the order says nothing; None where none are given."""
     from latticebench.bench.cli.arguments import asked
 
     if terms is None and system is None:
         return None
-    return asked(system, "equation" if terms is None else None, terms, None if system else 2)[1]
+    return asked(system, "equation" if terms is None else None, terms, order or (None if system else 2))[1]
 
 
 def _show(found: Inspection, samples: Samples) -> None:

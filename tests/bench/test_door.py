@@ -80,6 +80,9 @@ def test_inspect_shows_columns_units_noise_and_frequencies_and_draws_them(typed:
     # Free pendula of this length swing with sqrt(25) / 2 pi.
     assert any(abs(one - 0.8) < 0.05 for one in found["frequencies"])
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+    # Options of a fit, typed once more.
+    again, _ = typed("inspect", "pendula.csv", *READING, "--terms", "sin(u[n])", "--order", "2")
+    assert "theta_5_deg" in again
 
 
 def test_inspect_points_at_degrees_clipped_and_resting_sensors(typed: Typed, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import wilcoxon
 
 from latticebench.bench.fitting import FitCase
-from latticebench.bench.paired import SignedRank, holm, paired, signed_rank, verdict
+from latticebench.bench.paired import LEVEL, SignedRank, holm, least_p, paired, signed_rank, verdict
 from latticebench.bench.tables import cases
 from latticebench.bench.worker import outcome
 
@@ -53,6 +53,13 @@ def test_p_over_pairs_is_that_of_scipy_and_beyond_many_that_of_a_normal_distribu
     assert exact == pytest.approx(wilcoxon(np.log(first / second), method="exact").pvalue, rel=1e-9)
     monkeypatch.setattr("latticebench.bench.paired.MOST_EXACT", 10)
     assert signed_rank(first, second).p == pytest.approx(exact, rel=0.05)
+
+
+def test_no_cases_have_a_smaller_p_than_those_in_which_one_is_always_better() -> None:
+    for count in range(1, 12):
+        first = np.arange(1.0, count + 1)
+        assert signed_rank(first, 3 * first).p == pytest.approx(least_p(count))
+    assert least_p(5) > LEVEL > least_p(6)
 
 
 def test_the_seeds_of_a_case_get_one_sign_in_a_test_over_cases() -> None:
