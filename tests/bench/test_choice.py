@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import shutil
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,12 @@ from latticebench.bench import kinds
 from latticebench.bench.case import Case, Folders
 from latticebench.bench.choice import chosen
 from latticebench.bench.estimate import estimate
+from latticebench.bench.executors.executor import Ledger
+from latticebench.bench.executors.local import Local
 from latticebench.bench.fitting import FitCase
 from latticebench.bench.merge import merge
 from latticebench.bench.progress import PARTS, Lines, clock
+from latticebench.bench.provenance import origin
 from latticebench.bench.run import run
 from latticebench.bench.store import Shard, create, open_store
 from latticebench.bench.suite import Suite, load
@@ -77,12 +80,13 @@ def path(tmp_path: Path) -> str:
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run cases in this process: what workers do is tested elsewhere, and starting one takes seconds."""
 
-    def execute(cases: Iterable[Case], folders: Folders, **asked: Any) -> None:
+    def execute(_: Local, cases: Sequence[Case], folders: Folders, loads: Collection[str], ledger: Ledger) -> None:
+        made = origin(loads)
         for case in cases:
-            if asked["begin"](case) == "run":
-                asked["keep"](case, attempt(case, folders))
+            if ledger.begin(case) == "run":
+                ledger.keep(case, attempt(case, folders), made)
 
-    monkeypatch.setattr("latticebench.bench.executors.local.execute", execute)
+    monkeypatch.setattr(Local, "execute", execute)
 
 
 def fits(suite: Suite) -> Counter[tuple[str, str]]:
