@@ -93,8 +93,8 @@ def _share(sums: Int[ndarray, " case"]) -> float:
 
 
 def least_p(cases: int) -> float:
-    """Return the smallest p that so many cases can have, where one method is better in each of them."""
-    return min(float(2.0 ** (1 - cases)), 1.0)
+    """Return the smallest p that so many cases can have, before a correction: one method is better in each of them."""
+    return float(2.0 ** (1 - cases))
 
 
 def holm(p: Sequence[float]) -> Float[ndarray, " test"]:

@@ -74,7 +74,6 @@ def end(process: int, mark: str) -> None:
         process: its number; it may have ended before.
         mark: its mark.
     """
-    cgroup.end(mark)
     with contextlib.suppress(psutil.Error):
         leader = psutil.Process(process)
         # Its number may be another process's by now.
@@ -84,6 +83,8 @@ def end(process: int, mark: str) -> None:
             _end_all(lambda: started(process, mark))
             leader.kill()
     _end_all(lambda: [one for one in psutil.process_iter() if _marked(one, process, mark)])
+    # Last: what has left the group is found below its leader only while that is there.
+    cgroup.end(mark)
 
 
 def _end_all(look: Callable[[], list[psutil.Process]]) -> None:

@@ -51,11 +51,6 @@ class Origin:
         return replace(self, notes=(*self.notes, *notes))
 
 
-def _parts(array: ndarray) -> tuple[ndarray, ndarray]:
-    """Return the real and the imaginary part, whose absolute values do not overflow as that of both does."""
-    return array.real, array.imag
-
-
 @dataclass(frozen=True, eq=False)
 class Samples:
     """What was observed of one trajectory.
@@ -104,14 +99,6 @@ class Samples:
                 self._check_field(name)
         if all(np.all(np.isnan(self.u[some])) for some in rows_of(self.u)):
             raise InputError(f"{where}: every value of u is missing")
-        most = max(
-            float(np.nanmax(np.abs(part), initial=0)) for some in rows_of(self.u) for part in _parts(self.u[some])
-        )
-        if 0 < most < 1 / LARGEST_VALUE:
-            raise InputError(
-                f"{where}: no value of u is larger than {most:.3g}, and products of such are none in double precision; "
-                f"choose a smaller unit, in which one is {1 / LARGEST_VALUE:g} or more"
-            )
         if self.sigma is not None and not (np.isfinite(self.sigma) and self.sigma >= 0):
             raise InputError(f"{where}: sigma is {self.sigma!r}; a standard deviation is a number >= 0")
         if self.ends not in get_args(Ends):
@@ -150,7 +137,9 @@ class Samples:
         if np.iscomplexobj(array) and (name == "f" or not np.iscomplexobj(self.u)):
             raise InputError(f"{where}: {name} is complex; it must be real{'' if name == 'f' else ' as u is'}")
         for some in rows_of(array):
-            wrong = np.any([np.abs(part) > LARGEST_VALUE for part in _parts(array[some])], axis=0)
+            # Not by the absolute value of a complex number, which overflows.
+            parts = (array[some].real, array[some].imag)
+            wrong = (np.abs(parts[0]) > LARGEST_VALUE) | (np.abs(parts[1]) > LARGEST_VALUE)
             if not np.any(wrong):
                 continue
             row, site = (int(k) for k in np.argwhere(wrong)[0])

@@ -146,7 +146,7 @@ def _show(found: Contest) -> None:
     show_note(f"p: signed-rank test over the cases, corrected for {len(found.methods)} methods (Holm)")
     for cases in sorted(found.methods["cases"].unique()):
         if least_p(cases) > LEVEL:
-            show_note(f"{cases} cases cannot tell two methods apart: p is {least_p(cases):.2g} at the least; six can")
+            show_note(f"{cases} cases cannot tell two methods apart: p is {least_p(cases):.2g} at the least")
     if found.ranks is None:
         show_note("no mean ranks: they need three methods and two cases that all of them have")
         return
