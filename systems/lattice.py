@@ -7,8 +7,9 @@ says otherwise.
 from __future__ import annotations
 
 import ast
+import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -287,15 +288,21 @@ class System:
 
 def _numeric(text: str, values: Mapping[str, Any]) -> Any:
     """Return the value of a checked text for numbers or arrays in place of its names."""
-    import sympy
-
-    names = tuple(sorted(name for name in values if name != "n"))
-    expression = symbolic(text, names)
-    symbols = [sympy.Symbol(name, real=True) for name in values]
-    function = sympy.lambdify(symbols, expression, modules="numpy")
+    function = _compiled(text, tuple(values))
     # Far out a complex 1/cosh(x)**2 is nan and the real one 0; roots of negative numbers are complex only.
     found, wide = (function(*(np.asarray(value, dtype=kind) for value in values.values())) for kind in (float, complex))
     return wide if not np.all(np.isfinite(found)) and np.all(np.isfinite(wide)) else found
+
+
+@functools.cache
+def _compiled(text: str, names: tuple[str, ...]) -> Callable[..., Any]:
+    """Return a checked text as a NumPy function of its names."""
+    import sympy
+
+    expression = symbolic(text, tuple(sorted(name for name in names if name != "n")))
+    symbols = [sympy.Symbol(name, real=True) for name in names]
+    function: Callable[..., Any] = sympy.lambdify(symbols, expression, modules="numpy")
+    return function
 
 
 def _positive(value: Any) -> float:

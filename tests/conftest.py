@@ -2,7 +2,9 @@
 
 import importlib.util
 import os
+import subprocess
 import sys
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +14,7 @@ import hypothesis
 import pytest
 
 from commandline import Seeds
+from latticebench.bench import cgroup
 
 # Two threads on two busy cores are many times slower than one.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -57,3 +60,14 @@ def script() -> Callable[[str], ModuleType]:
         return module
 
     return load
+
+
+@pytest.fixture(scope="session")
+def groups() -> bool:
+    """Whether control groups can be made here."""
+    mark = uuid.uuid4().hex
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as trial:
+        cgroup.enter(trial.pid, mark)
+        found = cgroup.members(mark) == [trial.pid]
+    cgroup.end(mark)
+    return found

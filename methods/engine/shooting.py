@@ -12,7 +12,6 @@ next step. Standard errors follow from the inverse of the Gauss-Newton matrix.
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +22,7 @@ import numpy as np
 from latticebench.methods.engine.condensing import Condensed, condense
 from latticebench.methods.engine.record import Record
 from latticebench.methods.engine.scaled import Scaled
-from latticebench.methods.engine.sensitivity import Stretches, Transition
+from latticebench.methods.engine.sensitivity import MAX_SUBSTEPS, Stretches, Transition
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -32,6 +31,9 @@ if TYPE_CHECKING:
 # Noise below this share of the RMS of a field is round-off and the error of the integrator.
 LEAST_NOISE = 1e-11
 MAX_HALVINGS = 10
+# Where half of all stretches need more steps of the integrator than this, wrong coefficients make the motion far faster
+# than the samples can show, and no fit leads on from there. Fits that end well need 8 at most.
+FASTEST = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,17 +130,17 @@ def maximise(
         wanted = max(accuracy * float(np.min(sigma)), 1e-10 * float(np.max(scatter.height)))
         if wanted < 0.5 * reached:
             reached = wanted
-            substeps = side.substeps(point.state, [tolerances(record, sigma, reached) for record in records])
+            resolved = side.substeps(point.state, [tolerances(record, sigma, reached) for record in records])
+            if resolved is None:
+                break
+            substeps = resolved
         transitions = side.vary(point.state, substeps)
-        if not all(np.all(np.isfinite(one.end)) for one in transitions):
-            break
         point = _evaluate(records, point.state, [one.end for one in transitions])
         step = _gauss_newton(records, transitions, point, sigma, held)
         if step is None:
             break
         covariance = step.covariance
-        evaluate = functools.partial(side.evaluate, substeps=substeps)
-        found = _shortened(records, point, step, sigma, float(np.sum(scatter.counts)), evaluate)
+        found = _shortened(side, substeps, point, step, sigma, float(np.sum(scatter.counts)))
         if found is None:
             break
         length, point = found
@@ -286,7 +288,12 @@ class _Step:
 def _gauss_newton(
     records: Sequence[Record], transitions: Sequence[Transition], point: _Point, sigma: ndarray, held: bool
 ) -> _Step | None:
-    """Return the step of the linearised problem; None where the motion is so sensitive that the samples say nothing."""
+    """Return the step of the linearised problem; None where the motion is so sensitive that the samples say nothing.
+
+    A motion that is not finite is.
+    """
+    if not all(np.all(np.isfinite(one.end)) for one in transitions):
+        return None
     with np.errstate(over="ignore", invalid="ignore"):
         condensed = [
             _condense(record, one, record.seen / sigma[:, None, None], residual, defect)
@@ -313,12 +320,7 @@ def _condense(record: Record, transition: Transition, weight: ndarray, residual:
 
 
 def _shortened(
-    records: Sequence[Record],
-    point: _Point,
-    step: _Step,
-    sigma: ndarray,
-    count: float,
-    evaluate: Callable[[State], _Point],
+    side: _SideBySide, substeps: Sequence[ndarray], point: _Point, step: _Step, sigma: ndarray, count: float
 ) -> tuple[float, _Point] | None:
     """Halve a step until it improves the fit: its length and where it leads, or None where no length does.
 
@@ -326,13 +328,13 @@ def _shortened(
     What the linearised problem expects closing the gap to cost is no reason to go less far.
     """
     gap, chi2 = point.gap(step.sizes), point.chi2(sigma)
-    expected = step.expected(records, point, sigma)
+    expected = step.expected(side.records, point, sigma)
     closed_gap = 1e-4 * count
     # Closing a small gap may cost a little likelihood; the cost vanishes with the gap.
     slack = gap + 10 * np.sqrt(gap * count)
     length = 1.0
     for _ in range(MAX_HALVINGS):
-        trial = evaluate(point.state.moved(step.change, step.moves, length))
+        trial = side.evaluate(point.state.moved(step.change, step.moves, length), substeps=substeps)
         near = trial.gap(step.sizes)
         if gap > closed_gap:
             better = near <= max((1 - 0.1 * length) * gap, closed_gap)
@@ -400,12 +402,25 @@ class _SideBySide:
             ),
         )  # fmt: skip
 
-    def substeps(self, state: State, tolerance: Sequence[Float[ndarray, " state"]]) -> list[Int[ndarray, " stretch"]]:
-        """Return how many steps all stretches need; see `Stretches.substeps`."""
+    def substeps(
+        self, state: State, tolerance: Sequence[Float[ndarray, " state"]]
+    ) -> list[Int[ndarray, " stretch"]] | None:
+        """Return how many steps all stretches need, or None where half of them need more than FASTEST."""
         wide = [np.broadcast_to(one, (count, len(one))) for one, count in zip(tolerance, self.counts, strict=True)]
-        return self._each(
-            lambda stretches, group: stretches.substeps(state.coefficients, *_of_group(state, wide, group)), _rows
-        )
+
+        def needed(most: int) -> list[Int[ndarray, " stretch"]]:
+            return self._each(
+                lambda stretches, group: stretches.substeps(
+                    state.coefficients, *_of_group(state, wide, group), most=most
+                ),
+                _rows,
+            )
+
+        found = needed(2 * FASTEST)
+        together = np.concatenate(found)
+        if np.median(together) > FASTEST:
+            return None
+        return needed(MAX_SUBSTEPS) if np.any(together > FASTEST) else found
 
 
 def _rows(whole: ndarray, rows: slice) -> ndarray:

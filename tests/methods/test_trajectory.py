@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from commandline import SOON, no_longer_than
 from latticebench import systems
 from latticebench.bench.limit import bound_of
 from latticebench.methods.method import solve
@@ -199,3 +200,14 @@ def test_selection_goes_down_to_a_single_term():
     fit = solve(Trajectory(select=True), [samples], library("two", "u[n]; v[n]"), 2, 0)
     np.testing.assert_array_equal(fit.coefficients != 0, [True, False])
     assert fit.coefficients[0] == pytest.approx(-2.25, abs=0.02)
+
+
+def test_a_reading_that_dwarfs_all_others_leads_to_no_endless_fit():
+    # Its weight makes wrong coefficients so large that no number of steps follows the motion from sample to sample.
+    samples = seen("dnls", 0.01, 0, sites=3, times=sample_times(30, 29 / 3), ends="unknown")
+    dwarfed = samples.u * 1e-150
+    dwarfed[11, 0] = dwarfed[11, 0].real + 1e-101j
+    candidates = library("", "u[n]; u[n+1]; i*u[n]; i*u[n+1]")
+    with no_longer_than(SOON):
+        fit = solve(Trajectory(), [replace(samples, u=dwarfed)], candidates, 1, 0)
+    assert fit.status != "ok"
