@@ -162,8 +162,11 @@ def test_a_damaged_store_is_read_or_refused_in_one_line(made: Path, tmp_path: Pa
 
 @posix
 @pytest.mark.slow
-def test_many_damaged_stores_are_read_or_refused_in_one_line(made: Path, tmp_path: Path, seeds: Seeds) -> None:
-    survive_damage(made, tmp_path, seeds(1000, 1200))
+@pytest.mark.parametrize("first", range(1000, 1200, 50))
+def test_many_damaged_stores_are_read_or_refused_in_one_line(
+    made: Path, tmp_path: Path, seeds: Seeds, first: int
+) -> None:
+    survive_damage(made, tmp_path, seeds(first, first + 50))
 
 
 # Data
@@ -208,8 +211,11 @@ def test_damaged_data_are_fitted_or_refused_in_one_line(made: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_many_damaged_data_are_fitted_or_refused_in_one_line(made: Path, tmp_path: Path, seeds: Seeds) -> None:
-    survive_data(made, tmp_path, seeds(1000, 1400))
+@pytest.mark.parametrize("first", range(1000, 1400, 100))
+def test_many_damaged_data_are_fitted_or_refused_in_one_line(
+    made: Path, tmp_path: Path, seeds: Seeds, first: int
+) -> None:
+    survive_data(made, tmp_path, seeds(first, first + 100))
 
 
 @posix

@@ -98,8 +98,11 @@ def test_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_many_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Path, seeds: Seeds) -> None:
-    survive_cells(tmp_path, seeds(1000, 1150), ("least-squares", "stlsq", "weak", "sr3", "trajectory"))
+@pytest.mark.parametrize("first", range(1000, 1150, 25))
+def test_many_recordings_with_odd_cells_are_taken_or_refused_in_one_line(
+    tmp_path: Path, seeds: Seeds, first: int
+) -> None:
+    survive_cells(tmp_path, seeds(first, first + 25), ("least-squares", "stlsq", "weak", "sr3", "trajectory"))
 
 
 def test_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path, seeds: Seeds) -> None:
@@ -107,7 +110,8 @@ def test_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("first", range(2000, 2030, 10))
 def test_many_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon(
-    tmp_path: Path, seeds: Seeds
+    tmp_path: Path, seeds: Seeds, first: int
 ) -> None:
-    survive_diagnosis(tmp_path, seeds(2000, 2030))
+    survive_diagnosis(tmp_path, seeds(first, first + 10))

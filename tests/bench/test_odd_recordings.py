@@ -130,5 +130,8 @@ def test_an_odd_recording_is_diagnosed_or_refused_in_one_line_and_soon(tmp_path:
 
 
 @pytest.mark.slow
-def test_many_odd_recordings_are_diagnosed_or_refused_in_one_line_and_soon(tmp_path: Path, seeds: Seeds) -> None:
-    survive(tmp_path, seeds(1000, 1300))
+@pytest.mark.parametrize("first", range(1000, 1300, 50))
+def test_many_odd_recordings_are_diagnosed_or_refused_in_one_line_and_soon(
+    tmp_path: Path, seeds: Seeds, first: int
+) -> None:
+    survive(tmp_path, seeds(first, first + 50))
