@@ -9,25 +9,28 @@ walls.md; rows of the other are kept.
 runs the cases, keeps their results and prints their table - but in one process, without leases or limits of time or
 memory, and keeps all results at once when the last case has ended. Seconds are those of the whole command. In the
 suite `default` both begin at the same moment, each on a core of its own, so that what else the machine does slows both.
-Trivial cases are run with and without in turns, either one first every second time, since the process that keeps their
-results needs a part of another core.
+Of trivial cases the process that keeps their results needs a part of another core. There both are under way, but only
+one of them runs at a time: they take turns of a second, in which all processes of the other are stopped, and the
+seconds are those of its own turns. So what else the machine does slows both alike here, too.
 
 In the row of commit 09a63745e6cd, the side without keeps no results and prints no table.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pandas as pd
+import psutil
 
 from latticebench.bench.case import Case, Folders
 from latticebench.bench.executors.executor import Ledger
@@ -45,8 +48,8 @@ from latticebench.systems.files import write_text
 
 HERE = Path(__file__).parent
 PARTS = ("default", "trivial")
-# Trivial cases, and how often they are run.
-TRIVIAL, TIMES = 10_000, 8
+# Trivial cases, how often they are run, and the seconds of a turn.
+TRIVIAL, TIMES, TURN = 10_000, 5, 1.0
 SUITE = f"""title = "trivial cases"
 [methods.zero]
 method = "zero"
@@ -88,13 +91,13 @@ class Bare:
         return outcome(case, "ok", "", found)
 
 
-def started(suite: str, results: Path, *, walls: bool) -> subprocess.Popen[str]:
+def started(suite: str, results: Path, *, walls: bool) -> subprocess.Popen[bytes]:
     """Start a process that runs the cases of a suite, with walls or without."""
     program = [sys.executable, "-m", "latticebench", "run", suite, "--jobs", "1", "--yes", "--results", str(results)]
     # Workers of a run have one thread each.
     return subprocess.Popen(
         program if walls else [sys.executable, __file__, "--without", suite, f"{results} bare"],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD}, text=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env={**os.environ, **ONE_THREAD},
     )  # fmt: skip
 
 
@@ -103,29 +106,46 @@ def together(suite: str, results: Path) -> dict[bool, float]:
     begin = time.perf_counter()
     processes = {walls: started(suite, results, walls=walls) for walls in (True, False)}
     took: dict[bool, float] = {}
-    # A process must not wait for what it prints to be read.
-    readers = {walls: threading.Thread(target=process.communicate) for walls, process in processes.items()}
-    for reader in readers.values():
-        reader.start()
     while len(took) < len(processes):
-        for walls, reader in readers.items():
-            if walls not in took and not reader.is_alive():
+        for walls, process in processes.items():
+            if walls not in took and process.poll() is not None:
                 took[walls] = time.perf_counter() - begin
-                check(processes[walls])
+                check(process)
         time.sleep(0.02)
     return took
 
 
-def alone(suite: str, results: Path, *, walls: bool) -> float:
-    """Return the seconds of one, from its start to its end."""
-    begin = time.perf_counter()
-    process = started(suite, results, walls=walls)
-    process.communicate()
-    check(process)
-    return time.perf_counter() - begin
+def in_turns(suite: str, results: Path, first: bool) -> dict[bool, float]:
+    """Return the seconds of the turns of both, of which one runs while all processes of the other are stopped."""
+    took = {first: 0.0, not first: 0.0}
+    processes: dict[bool, subprocess.Popen[bytes]] = {}
+    while running := [walls for walls in took if walls not in processes or processes[walls].poll() is None]:
+        for walls in running:
+            begin = time.perf_counter()
+            if walls in processes:
+                send(processes[walls], signal.SIGCONT)
+            else:
+                processes[walls] = started(suite, results, walls=walls)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                processes[walls].wait(TURN if len(running) > 1 else None)
+            if processes[walls].poll() is None:
+                send(processes[walls], signal.SIGSTOP)
+            took[walls] += time.perf_counter() - begin
+    for process in processes.values():
+        check(process)
+    return took
 
 
-def check(process: subprocess.Popen[str]) -> None:
+def send(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    """Send a signal to a process, and then to all that it has started."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        process.send_signal(number)
+        for one in psutil.Process(process.pid).children(recursive=True):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                one.send_signal(number)
+
+
+def check(process: subprocess.Popen[bytes]) -> None:
     """Stop if a process has failed."""
     if process.returncode:
         raise SystemExit(f"{process.args!r}: exit code {process.returncode}")
@@ -139,8 +159,7 @@ def pairs(part: str, kept: Path, folder: Path) -> Iterator[tuple[str, int, dict[
     suite = folder / "trivial.toml"
     suite.write_text(SUITE)
     for number in range(TIMES):
-        order = (True, False) if number % 2 else (False, True)
-        yield part, TRIVIAL, {walls: alone(str(suite), folder / str(number), walls=walls) for walls in order}
+        yield part, TRIVIAL, in_turns(str(suite), folder / str(number), first=bool(number % 2))
 
 
 def measured(part: str, kept: Path) -> Iterator[dict[str, object]]:
