@@ -23,6 +23,8 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 # Seeds of one number of `--fresh`.
 APART = 1_000_000
+# Examples of a hypothesis test that sets no number of its own, with fresh seeds; 100 otherwise.
+FRESH_EXAMPLES = 500
 RESULTS = Path(__file__).parents[1] / "results"
 
 
@@ -33,7 +35,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     hypothesis.settings.register_profile("repeated", derandomize=True)
-    hypothesis.settings.register_profile("fresh", database=None)
+    hypothesis.settings.register_profile("fresh", database=None, max_examples=FRESH_EXAMPLES)
     hypothesis.settings.load_profile("fresh" if config.getoption("--fresh") else "repeated")
 
 
