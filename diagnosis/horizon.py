@@ -177,14 +177,20 @@ class Layout:
 
     def with_substeps(self, model: Model, nodes: Sequence[ndarray], top: float) -> Layout:
         """Return the same with the integrator that needs the least work near given states, and its steps."""
-        short, long = (replace(self, integrator=way)._steps(model, nodes, top) for way in ("rk45", "dop853"))
-        work = [stages * sum(int(np.sum(one)) for one in steps) for stages, steps in ((6, short), (12, long))]
-        if work[0] < work[1]:
-            return replace(self, substeps=short, integrator="rk45")
-        return replace(self, substeps=long, integrator="dop853")
+        ways = [replace(self, integrator=way) for way in ("rk45", "dop853")]
+        (short, short_enough), (long, long_enough) = (way._steps(model, nodes, top) for way in ways)
+        # Where the one of low order may take no more steps, it would need twice as many at least.
+        counted = [steps * np.where(enough, 1, 2) for steps, enough in zip(short, short_enough, strict=True)]
+        falls_short = any(np.any(one & ~other) for one, other in zip(long_enough, short_enough, strict=True))
+        if 6 * sum(map(np.sum, counted)) < 12 * sum(map(np.sum, long)) and not falls_short:
+            return replace(ways[0], substeps=short)
+        return replace(ways[1], substeps=long)
 
-    def _steps(self, model: Model, nodes: Sequence[ndarray], top: float) -> tuple[Int[ndarray, " intervals"], ...]:
-        found = []
+    def _steps(
+        self, model: Model, nodes: Sequence[ndarray], top: float
+    ) -> tuple[tuple[Int[ndarray, " intervals"], ...], tuple[Bool[ndarray, " intervals"], ...]]:
+        """Return the steps of each interval, and whether they were fewer than it may take."""
+        found, enough = [], []
         for number in range(len(self.records)):
             assembled = model.assembled(self.plain, self.chain, number)
             y = nodes[number]
@@ -197,12 +203,11 @@ class Layout:
             # In a single step through a gap the motion would be lost.
             lasting = np.ceil((stretches.end - stretches.begin) / float(np.median(np.diff(self.records[number].times))))
             least = np.maximum(lasting, 1).astype(int)
-            needed = stretches.substeps(
-                assembled.coefficients, flat, tolerance, self.curves[number],
-                np.maximum(MOST_SUBSTEPS // least, MOST_IN_GAPS), least,
-            )  # fmt: skip
+            most = np.maximum(MOST_SUBSTEPS // least, MOST_IN_GAPS)
+            needed = stretches.substeps(assembled.coefficients, flat, tolerance, self.curves[number], most, least)
             found.append(needed)
-        return tuple(found)
+            enough.append(needed * 2 <= most * least)
+        return tuple(found), tuple(enough)
 
 
 def _pieces(times: Float[ndarray, " time"], length: int, longest: float) -> list[tuple[int, int]]:

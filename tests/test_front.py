@@ -211,6 +211,14 @@ def test_readings_without_noise_do_not_contradict_themselves(damping, sites, spa
     assert all("at most" in line for line in cause.report.noise_lines)
 
 
+def test_a_few_readings_without_noise_that_are_far_apart_do_not_contradict_themselves():
+    known = lb.systems.find("phi4")
+    samples = simulate(known, sites=5, times=np.linspace(0, 55 / 6, 12), integrator="dop853")
+    cause = lb.diagnose(lb.Recording((samples,)), lb.system("phi4"))
+    assert cause.verdict == "nothing missing"
+    assert cause.result.residual[1] < 1
+
+
 def test_a_bound_and_a_diagnosis_are_objects_with_tables():
     data = swing()
     bound = lb.limit(data, PENDULUM)

@@ -83,6 +83,16 @@ def test_pieces_have_every_row_once_and_each_follows_from_its_own_start(length):
         np.testing.assert_allclose(piece[seen], exact, atol=1e-6)
 
 
+def test_of_readings_far_apart_the_integrator_is_one_that_is_right_not_one_that_may_take_no_more_steps():
+    t = EVEN[::24]
+    problem = Problem.of(DECLARED, 2, [recording(t, 0)], CATALOGUE)
+    layout = Layout.of(problem, len(t), None, 1e-8)
+    path = followed(problem, layout, Model(DECLARED, 2, TRUTH), small=1e-8)
+    found = path.nodes[0][0]
+    exact = solve_ivp(rate, t[[0, -1]], found[0], t_eval=t, method="DOP853", rtol=1e-12, atol=1e-13).y.T
+    np.testing.assert_allclose(found, exact, atol=1e-7)
+
+
 def test_a_model_that_runs_away_is_not_followed():
     problem = Problem.of(DECLARED, 2, [recording(EVEN)], CATALOGUE)
     layout = Layout.of(problem, len(EVEN), None, 1e-4)
