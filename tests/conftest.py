@@ -76,7 +76,7 @@ def script() -> Callable[[str], ModuleType]:
 def groups() -> bool:
     """Whether control groups can be made here."""
     mark = uuid.uuid4().hex
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as trial:
+    with subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE) as trial:
         cgroup.enter(trial.pid, mark)
         found = cgroup.members(mark) == [trial.pid]
     cgroup.end(mark)
