@@ -135,7 +135,7 @@ def alive(marker: str) -> list[str]:
 def every_one_is_a_row(folder: Path, deeds: Sequence[str], groups: bool) -> None:
     marker = f"marker-{os.getpid()}-{time.monotonic_ns()}"
     if not groups:
-        # Nothing else finds it.
+        # Without a group nothing finds what hides.
         deeds = [name for name in deeds if name != "hides"]
     results, _ = run(load(str(write_suite(folder, marker, deeds))), create(folder / "store"), jobs=2)
     found = {(one["case"]["label"], one["case"]["seed"]): one for one in results}
