@@ -7,6 +7,8 @@ import sys
 from contextlib import suppress
 from types import TracebackType
 
+from latticebench.bench.tree import Tree, end
+
 # Nothing is imported from the working folder.
 START = "import sys; sys.path[:] = sys.argv[1].split('\\n'); from latticebench.bench.guardian import watch; watch()"
 
@@ -20,14 +22,9 @@ class Guardian:
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
         return self
 
-    def watch_over(self, worker: int, mark: str) -> None:
-        """Tell it of a worker.
-
-        Args:
-            worker: the number of its process.
-            mark: see `bench.tree`.
-        """
-        self._tell(f"{worker} {mark}")
+    def watch_over(self, tree: Tree) -> None:
+        """Tell it of a worker, or what is known of it now."""
+        self._tell(f"{tree.mark} {tree.shield} {tree.worker}")
 
     def forget(self, mark: str) -> None:
         """Tell it that a worker has been ended."""
@@ -56,14 +53,12 @@ def search_path() -> str:
 
 def watch() -> None:
     """Read of workers until the runner's end of the pipe is closed, then end those that are left."""
-    from latticebench.bench.tree import end
-
-    workers: dict[str, int] = {}
+    workers: dict[str, Tree] = {}
     for line in sys.stdin.buffer:
-        *number, mark = line.decode().split()
-        if number:
-            workers[mark] = int(number[0])
+        mark, *numbers = line.decode().split()
+        if numbers:
+            workers[mark] = Tree(mark, *map(int, numbers))
         else:
             workers.pop(mark, None)
-    for mark, worker in workers.items():
-        end(worker, mark)
+    for tree in workers.values():
+        end(tree)

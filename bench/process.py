@@ -15,6 +15,7 @@ import threading
 import time
 import uuid
 from collections import deque
+from dataclasses import replace
 from queue import SimpleQueue
 from typing import Any
 
@@ -22,11 +23,11 @@ from latticebench.bench import cgroup
 from latticebench.bench.case import STATUSES, Case, Folders
 from latticebench.bench.guardian import Guardian, search_path
 from latticebench.bench.threads import ONE_THREAD
-from latticebench.bench.tree import MARK, end, resident_mib, started
+from latticebench.bench.tree import MARK, Tree, end, resident_mib, started
 from latticebench.bench.worker import LENGTH, MOST_BYTES, one_line, outcome, too_much
 
 # Nothing is imported from the working folder.
-START = "import sys; sys.path[:] = sys.argv[1].split('\\n'); from latticebench.bench.worker import serve; serve()"
+START = "import sys; sys.path[:] = sys.argv[1].split('\\n'); from latticebench.bench.shield import serve; serve()"
 # Seconds until a new worker has imported what it needs.
 START_LIMIT = 120.0
 # Seconds within which a case is so quick that another one may wait behind it.
@@ -54,20 +55,31 @@ class Process:
         self.quick = self.last = False
         # Where in the file what the present case prints begins, and what of it is in the file no more.
         self.place, self.kept = 0, ""
-        self.mark = uuid.uuid4().hex
+        mark = uuid.uuid4().hex
         self.printed, written = _nameless_file()
         self.process = subprocess.Popen(
-            [sys.executable, "-X", "faulthandler", "-c", START, search_path()],
+            [sys.executable, "-c", START, search_path()],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=written,
-            env={**os.environ, **ONE_THREAD, MARK: self.mark}, start_new_session=True,
+            env={**os.environ, **ONE_THREAD, MARK: mark}, start_new_session=True,
         )  # fmt: skip
         written.close()
-        # It has no case yet, and so has started nothing.
-        cgroup.enter(self.process.pid, self.mark)
+        cgroup.enter(self.process.pid, mark)
         self.guardian = guardian
-        guardian.watch_over(self.process.pid, self.mark)
+        self._is(Tree(mark, shield=self.process.pid, worker=self.process.pid))
+        self._send(b"\n")
         self.listener = threading.Thread(target=self._listen, args=(events,), daemon=True)
         self.listener.start()
+
+    def _is(self, tree: Tree) -> None:
+        self.tree = tree
+        self.guardian.watch_over(tree)
+
+    def _send(self, request: bytes) -> None:
+        assert self.process.stdin is not None
+        # A worker that has ended is found out by `overdue`.
+        with contextlib.suppress(OSError):
+            self.process.stdin.write(request)
+            self.process.stdin.flush()
 
     def _listen(self, events: Events) -> None:
         assert self.process.stdout is not None
@@ -79,15 +91,11 @@ class Process:
 
     def hand(self, case: Case, folders: Folders) -> None:
         """Hand a case to the worker, which begins with it when it has done those before."""
-        assert self.process.stdin is not None
         if not self.cases:
             self.since = time.monotonic()
         self.cases.append(case)
         request = pickle.dumps((case, folders))
-        # A worker that has ended is found out by `overdue`.
-        with contextlib.suppress(OSError):
-            self.process.stdin.write(len(request).to_bytes(LENGTH, "big") + request)
-            self.process.stdin.flush()
+        self._send(len(request).to_bytes(LENGTH, "big") + request)
 
     @property
     def takes_another(self) -> bool:
@@ -115,8 +123,10 @@ class Process:
             return None
         try:
             told = json.loads(line)
-            if told.get("begun") == self.number:
+            # The first line, before it has run anything, and no other.
+            if not self.begun and told.get("begun") == self.number:
                 self.begun, self.since = True, time.monotonic()
+                self._is(replace(self.tree, worker=int(told["worker"])))
                 return None
             if told["done"] != self.number:
                 return None
@@ -140,7 +150,7 @@ class Process:
         if time.monotonic() - self.since > limit:
             what = f"no result within the time limit of {limit:g} s" if self.begun else "the worker did not start"
             return self._finish(outcome(case, "timeout" if self.begun else "died", what))
-        if resident_mib(self.process.pid, self.mark, whole=bool(self.code)) > case.memory_limit:
+        if resident_mib(self.tree, whole=bool(self.code)) > case.memory_limit:
             return self._finish(outcome(case, "memory", too_much(case)))
         if self.printed.seek(0, os.SEEK_END) > MOST_PRINTED:
             self.kept, self.place = self._tail(None), 0
@@ -162,7 +172,7 @@ class Process:
         text = self._tail(printed) if self.code or result["status"] not in ("ok", "skipped") else ""
         if text:
             result["reason"] = f"{result['reason']}; " * bool(result["reason"]) + f"printed: {text}"
-        if self.code and not (keep and result["status"] == "ok" and not started(self.process.pid, self.mark)):
+        if self.code and not (keep and result["status"] == "ok" and not started(self.tree)):
             keep = False
         now = time.monotonic()
         self.quick = now - self.since < QUICK
@@ -191,10 +201,10 @@ class Process:
         """End the worker with all that it has started, whatever they are doing."""
         if self.closed:
             return
-        end(self.process.pid, self.mark)
+        end(self.tree)
         self.process.kill()
         self.process.wait()
-        self.guardian.forget(self.mark)
+        self.guardian.forget(self.tree.mark)
         assert self.process.stdin is not None
         # What was left unsent is of no use to anybody.
         with contextlib.suppress(OSError):

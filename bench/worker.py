@@ -38,7 +38,7 @@ def serve() -> None:
         number += 1
         # The first case has waited for this process to start; each later one is taken as it comes.
         if number == 1:
-            _answer(answers, {"begun": number})
+            _answer(answers, {"begun": number, "worker": own})
         threads = threading.active_count()
         result = attempt(case, folders)
         for stream in (sys.stdout, sys.stderr):

@@ -54,8 +54,8 @@ def test_what_hides_is_found_in_the_group_and_ended_with_it(mark: str) -> None:
         cgroup.enter(leader.pid, mark)
         out, _ = leader.communicate("go\n")
     left = int(out)
-    assert [one.pid for one in tree.started(leader.pid, mark)] == [left]
-    tree.end(leader.pid, mark)
+    assert [one.pid for one in tree.started(tree.Tree(mark, leader.pid, leader.pid))] == [left]
+    tree.end(tree.Tree(mark, leader.pid, leader.pid))
     soon(lambda: gone(left))
     assert cgroup.members(mark) == []
 
@@ -67,8 +67,8 @@ def test_the_memory_of_what_hides_counts(mark: str) -> None:
         assert other.stdout is not None
         other.stdout.readline()
         own = psutil.Process().memory_info().rss / 2**20
-        assert tree.resident_mib(os.getpid(), mark, whole=True) > 128
-        assert tree.resident_mib(os.getpid(), mark, whole=False) == pytest.approx(own, rel=0.5)
+        assert tree.resident_mib(tree.Tree(mark, os.getpid(), os.getpid()), whole=True) > 128
+        assert tree.resident_mib(tree.Tree(mark, os.getpid(), os.getpid()), whole=False) == pytest.approx(own, rel=0.5)
         cgroup.end(mark)
         assert other.wait(60) == -9
 

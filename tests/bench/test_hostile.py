@@ -81,6 +81,14 @@ DEEDS: dict[str, tuple[str, str, str, str]] = {
         "timeout", "time limit",
     ),
     "hides": ("", "sleeper(start_new_session=True, env={{}})\nos.kill(os.getpid(), 9)", "died", "SIGKILL"),
+    "hides from both": (
+        "",
+        "sleeper(start_new_session=True, env={{}})\nos.kill(os.getppid(), 9)\nos.kill(os.getpid(), 9)",
+        "died", "SIGKILL",
+    ),
+    "kills its parent": ("", "os.kill(os.getppid(), 9)\ntime.sleep(3600)", "died", "SIGKILL"),
+    "kills its group": ("", "os.killpg(0, 9)", "died", "SIGKILL"),
+    "stops its parent": ("", "os.kill(os.getppid(), signal.SIGSTOP)", "ok", ""),
     "children eat": (
         "", "many = [sleeper(eats=2**29) for _ in range(2)]\nmany[0].wait()", "memory", "900 MiB",
     ),
@@ -98,7 +106,8 @@ DEEDS: dict[str, tuple[str, str, str, str]] = {
 
 # Each starts a worker of its own; the others are of the same kinds, or in `test_run.py`, where one does for several.
 QUICK = (
-    "prints when imported", "leaves a session", "leaves an orphan", "hides", "children eat", "floods", "answers itself",
+    "prints when imported", "leaves a session", "leaves an orphan", "hides", "kills its parent", "children eat",
+    "floods", "answers itself",
 )  # fmt: skip
 
 
@@ -135,8 +144,8 @@ def alive(marker: str) -> list[str]:
 def every_one_is_a_row(folder: Path, deeds: Sequence[str], groups: bool) -> None:
     marker = f"marker-{os.getpid()}-{time.monotonic_ns()}"
     if not groups:
-        # Without a group nothing finds what hides.
-        deeds = [name for name in deeds if name != "hides"]
+        # Without a group nothing finds what hides when its worker and the process above that are dead.
+        deeds = [name for name in deeds if name != "hides from both"]
     results, _ = run(load(str(write_suite(folder, marker, deeds))), create(folder / "store"), jobs=2)
     found = {(one["case"]["label"], one["case"]["seed"]): one for one in results}
     assert [found["good", number]["status"] for number in range(len(deeds))] == ["ok"] * len(deeds)
