@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import FrameType
+from typing import Any
 from unittest import mock
 
 import pytest
@@ -20,6 +21,8 @@ from pace import pace
 
 # Gives the seeds of an attack from one number to before another; `--fresh` moves them.
 Seeds = Callable[[int, int], range]
+# A long attack runs one of so many of its blocks again and again with the same seeds, and all of them with `--fresh`.
+REPEATED = 3
 # Processor seconds of a 2.5 GHz core after which what is small, or refused, counts as a hang.
 SOON = 20.0
 # A suite of four small cases; an equation for any recording, and its fit.
@@ -38,6 +41,14 @@ noise = [0.0, 0.01]
 """
 EQUATION = ("--terms", "u[n]; u[n]**3", "--order", 2, "--ends", "free")
 FIT = (*EQUATION, "--method", "least-squares")
+
+
+def blocks(first: int, end: int, length: int) -> list[Any]:
+    """Return where the blocks of a long attack begin, which takes the seeds from one number to before another."""
+    return [
+        pytest.param(begin, marks=[pytest.mark.fresh] if number % REPEATED else [])
+        for number, begin in enumerate(range(first, end, length))
+    ]
 
 
 def latticebench(*arguments: object, cwd: Path) -> tuple[int, str, str]:

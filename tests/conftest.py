@@ -39,6 +39,13 @@ def pytest_configure(config: pytest.Config) -> None:
     hypothesis.settings.load_profile("fresh" if config.getoption("--fresh") else "repeated")
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--fresh"):
+        left_out = [item for item in items if item.get_closest_marker("fresh")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
+
+
 def pytest_collection_finish() -> None:
     # What the tests have imported stays: looking at it again and again takes a twentieth of their time.
     gc.collect()

@@ -19,7 +19,7 @@ from unittest import mock
 
 import pytest
 
-from commandline import EQUATION, FIT, SOON, Seeds, latticebench, no_longer_than, refused, soon
+from commandline import EQUATION, FIT, SOON, Seeds, blocks, latticebench, no_longer_than, refused, soon
 from latticebench.bench.store import FILE
 from latticebench.bench.suite import load
 from latticebench.systems.errors import InputError
@@ -162,7 +162,7 @@ def test_a_damaged_store_is_read_or_refused_in_one_line(made: Path, tmp_path: Pa
 
 @posix
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(1000, 1200, 50))
+@pytest.mark.parametrize("first", blocks(1000, 1200, 50))
 def test_many_damaged_stores_are_read_or_refused_in_one_line(
     made: Path, tmp_path: Path, seeds: Seeds, first: int
 ) -> None:
@@ -211,7 +211,7 @@ def test_damaged_data_are_fitted_or_refused_in_one_line(made: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(1000, 1400, 100))
+@pytest.mark.parametrize("first", blocks(1000, 1400, 100))
 def test_many_damaged_data_are_fitted_or_refused_in_one_line(
     made: Path, tmp_path: Path, seeds: Seeds, first: int
 ) -> None:

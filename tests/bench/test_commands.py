@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from commandline import SUITE, Seeds, latticebench, soon
+from commandline import SUITE, Seeds, blocks, latticebench, soon
 from latticebench.bench.store import FILE
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pipes and devices as POSIX has them")
@@ -85,6 +85,6 @@ def test_odd_command_lines_work_or_are_refused_in_one_line(tmp_path: Path, seeds
 
 @posix
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(1000, 1300, 100))
+@pytest.mark.parametrize("first", blocks(1000, 1300, 100))
 def test_many_odd_command_lines_work_or_are_refused_in_one_line(tmp_path: Path, seeds: Seeds, first: int) -> None:
     survive_commands(tmp_path, seeds(first, first + 100))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from commandline import Seeds, soon, succeed
+from commandline import Seeds, blocks, soon, succeed
 
 ODD = ("1e49", "-1e49", "1e-300", "0", "-0", "", "nan", "+3", "1E1", ".5", "123456789012345678901234567890")
 FACTORS = (1e-300, 1e-150, 1e-60, 1e-6, -1.0, 1e6, 1e45)
@@ -98,7 +98,7 @@ def test_recordings_with_odd_cells_are_taken_or_refused_in_one_line(tmp_path: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(1000, 1150, 25))
+@pytest.mark.parametrize("first", blocks(1000, 1150, 25))
 def test_many_recordings_with_odd_cells_are_taken_or_refused_in_one_line(
     tmp_path: Path, seeds: Seeds, first: int
 ) -> None:
@@ -110,7 +110,7 @@ def test_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(2000, 2030, 10))
+@pytest.mark.parametrize("first", blocks(2000, 2030, 10))
 def test_many_recordings_with_odd_cells_are_diagnosed_or_refused_in_one_line_and_soon(
     tmp_path: Path, seeds: Seeds, first: int
 ) -> None:

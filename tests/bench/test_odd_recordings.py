@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from commandline import Seeds, soon
+from commandline import Seeds, blocks, soon
 from latticebench.systems.samples import Samples
 from latticebench.systems.writers import write
 
@@ -130,7 +130,7 @@ def test_an_odd_recording_is_diagnosed_or_refused_in_one_line_and_soon(tmp_path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(1000, 1300, 50))
+@pytest.mark.parametrize("first", blocks(1000, 1300, 50))
 def test_many_odd_recordings_are_diagnosed_or_refused_in_one_line_and_soon(
     tmp_path: Path, seeds: Seeds, first: int
 ) -> None:
