@@ -330,12 +330,21 @@ def _add_rows(sums: _Sums, rows: ndarray, target: ndarray, outputs: Sequence[nda
     sums.aim += np.sum(pulled[:, first:], axis=0)
     for i, lower in enumerate(outputs):
         own = slice(i * r, (i + 1) * r)
-        np.add.at(sums.right, lower, pulled[:, own])
-        np.add.at(sums.border, lower, product[:, own, first:])
+        _add_at(sums.right, (lower,), pulled[:, own])
+        _add_at(sums.border, (lower,), product[:, own, first:])
         for j, upper in enumerate(outputs):
             below = lower >= upper
             place = upper[below], (lower - upper)[below]
-            np.add.at(sums.band, place, product[below, own, j * r : (j + 1) * r])
+            _add_at(sums.band, place, product[below, own, j * r : (j + 1) * r])
+
+
+def _add_at(total: ndarray, place: tuple[ndarray, ...], parts: ndarray) -> None:
+    """Add each part at its place; several may have the same, as at a free end, where a neighbour is the site itself."""
+    if len(np.unique(np.column_stack(place), axis=0)) == len(parts):
+        # Some ten times as fast.
+        total[place] += parts
+    else:
+        np.add.at(total, place, parts)
 
 
 def _eliminated(sums: _Sums, turn: ndarray, rows: ndarray) -> StepEquations:

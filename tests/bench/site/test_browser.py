@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,21 @@ BROWSER = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
 )
 DESKTOP, PHONE = (1280, 900), (390, 844)
+# So many pages are opened at once.
+TOGETHER = 16
 
 # Every text that is shown has its contrast to what is behind it, and a place.
 LOOK = """
 const shown = (one) => one.checkVisibility() && one.getClientRects().length;
 const parts = (colour) => (colour.match(/[\\d.]+/g) ?? []).map(Number);
+const known = new Map();
 const behind = (one) => {
-  for (let up = one; up; up = up.parentElement) {
-    const [r, g, b, a = 1] = parts(getComputedStyle(up).backgroundColor);
-    if (a > 0.99) return [r, g, b];
+  if (!one) return [255, 255, 255];
+  if (!known.has(one)) {
+    const [r, g, b, a = 1] = parts(getComputedStyle(one).backgroundColor);
+    known.set(one, a > 0.99 ? [r, g, b] : behind(one.parentElement));
   }
-  return [255, 255, 255];
+  return known.get(one);
 };
 const light = (colour) => {
   const [r, g, b] = colour.map((c) => c / 255).map((c) => (c <= 0.03928 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4));
@@ -110,58 +115,68 @@ def browsed(path: Path, profile: Path, size: tuple[int, int]) -> tuple[str, list
     return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
 
 
-def measured(path: Path, folder: Path, script: str, size: tuple[int, int], *, dark: bool = False) -> dict[str, Any]:
-    """Run a script of the test's own in a page, whose policy against scripts is taken off for it."""
-    text = path.read_text(encoding="utf-8")
-    bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', f'<base href="{path.parent.as_uri()}/">', text)
-    assert bare != text
-    if dark:
-        bare = bare.replace("@media (prefers-color-scheme: dark)", "@media all")
-    run = f"""<script>addEventListener('load', () => setTimeout(() => {{
-      const found = () => {{ {script} }};
-      try {{ parent.postMessage(JSON.stringify(found()), '*'); }}
-      catch (error) {{ parent.postMessage(JSON.stringify({{ error: String(error.stack) }}), '*'); }}
-    }}, 200));</script>"""
-    (folder / "inner.html").write_text(bare.replace("</body>", run + "</body>"), encoding="utf-8")
-    # A window cannot be as narrow as a phone, a frame can.
+def framed(pages: Sequence[str], size: tuple[int, int]) -> str:
+    """Return a page with others in it, each in a frame: a window cannot be as narrow as a phone, a frame can."""
+    frames = (f'<iframe src="{one}" width="{size[0]}" height="{size[1]}" style="border:0"></iframe>' for one in pages)
+    return "\n".join(frames)
+
+
+def measured(
+    paths: Sequence[Path], folder: Path, script: str, size: tuple[int, int], *, dark: bool = False
+) -> list[dict[str, Any]]:
+    """Run a script of the test's own in each of some pages, whose policy against scripts is taken off for it."""
+    for number, path in enumerate(paths):
+        text = path.read_text(encoding="utf-8")
+        base = f'<base href="{path.parent.as_uri()}/">'
+        bare = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', base, text)
+        assert bare != text
+        if dark:
+            bare = bare.replace("@media (prefers-color-scheme: dark)", "@media all")
+        run = f"""<script>addEventListener('load', () => setTimeout(() => {{
+          const found = () => {{ {script} }};
+          const tell = (what) => parent.postMessage(JSON.stringify([{number}, what]), '*');
+          try {{ tell(found()); }} catch (error) {{ tell({{ error: String(error.stack) }}); }}
+        }}, 200));</script>"""
+        (folder / f"inner{number}.html").write_text(bare.replace("</body>", run + "</body>"), encoding="utf-8")
     copy = folder / "page.html"
-    copy.write_text(f"""<iframe src="inner.html" width="{size[0]}" height="{size[1]}" style="border:0"></iframe>
-      <pre id="measured"></pre><script>addEventListener('message', (event) => {{
-        document.querySelector('#measured').textContent = event.data; }});</script>""")
+    inner = [f"inner{number}.html" for number in range(len(paths))]
+    copy.write_text(f"""<pre id="measured"></pre><script>const told = []; addEventListener('message', (event) => {{
+      told.push(JSON.parse(event.data)); document.querySelector('#measured').textContent = JSON.stringify(told); }});
+      </script>{framed(inner, size)}""")
     document, _ = browsed(copy, folder / "profile", size)
-    inner = re.search(r'<pre id="measured">(.*?)</pre>', document, re.DOTALL)
-    assert inner is not None
-    found: dict[str, Any] = json.loads(html.unescape(inner[1]))
-    assert "error" not in found, found["error"]
-    return found
+    text_found = re.search(r'<pre id="measured">(.*?)</pre>', document, re.DOTALL)
+    assert text_found is not None
+    told: dict[int, dict[str, Any]] = dict(json.loads(html.unescape(text_found[1])))
+    assert sorted(told) == list(range(len(paths)))
+    errors = [found["error"] for found in told.values() if "error" in found]
+    assert not errors
+    return [told[number] for number in range(len(paths))]
 
 
-def looks_right(path: Path, folder: Path, size: tuple[int, int], *, dark: bool = False) -> None:
-    found = measured(path, folder, LOOK, size, dark=dark)
-    assert found["window"] == size[0]
-    assert found["wide"] <= found["window"], path
-    assert not found["beyond"], path
-    assert found["styles"] > 3
-    assert not found["poor"], path
-    assert found["dark"] == dark
-    assert found["unnamed"] == 0
-    assert found["headings"] == 1
+def look_right(paths: Sequence[Path], folder: Path, size: tuple[int, int], *, dark: bool = False) -> None:
+    for path, found in zip(paths, measured(paths, folder, LOOK, size, dark=dark), strict=True):
+        assert found["window"] == size[0], path
+        assert found["wide"] <= found["window"], path
+        assert not found["beyond"], path
+        assert found["styles"] > 3, path
+        assert not found["poor"], path
+        assert found["dark"] == dark, path
+        assert found["unnamed"] == 0, path
+        assert found["headings"] == 1, path
 
 
-@pytest.mark.parametrize("name", ["index.html", "default/index.html"])
-def test_a_page_fits_a_desktop_and_a_phone_and_can_be_read_in_light_and_dark(
-    whole_site: Path, tmp_path: Path, name: str
-) -> None:
-    looks_right(whole_site / name, tmp_path, DESKTOP)
-    looks_right(whole_site / name, tmp_path, PHONE, dark=True)
+def test_a_page_fits_a_desktop_and_a_phone_and_can_be_read_in_light_and_dark(whole_site: Path, tmp_path: Path) -> None:
+    paths = [whole_site / "index.html", whole_site / "default" / "index.html"]
+    look_right(paths, tmp_path, DESKTOP)
+    look_right(paths, tmp_path, PHONE, dark=True)
 
 
 def test_a_page_with_labels_that_attack_runs_nothing_of_theirs_and_still_works(site: Path, tmp_path: Path) -> None:
     path = site / "mine" / "index.html"
     _, said = browsed(path, tmp_path / "profile", DESKTOP)
     assert said == []
-    looks_right(path, tmp_path, PHONE)
-    found = measured(path, tmp_path, "document.querySelector('a.how').click();"
+    look_right([path], tmp_path, PHONE)
+    (found,) = measured([path], tmp_path, "document.querySelector('a.how').click();"
                      "return {told: document.querySelector('dialog').innerText,"
                      "tags: document.querySelectorAll('b, i, img').length}", DESKTOP)  # fmt: skip
     assert "<script>alert(1)</script>" in found["told"]
@@ -172,7 +187,10 @@ def test_a_page_with_labels_that_attack_runs_nothing_of_theirs_and_still_works(s
 def test_what_a_page_complains_of_is_seen(site: Path, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     page.write_text("<script>console.error('here')</script>")
-    assert browsed(page, tmp_path / "profile", DESKTOP)[1]
+    around = tmp_path / "around.html"
+    around.write_text(framed(["page.html"], DESKTOP))
+    for path in (page, around):
+        assert browsed(path, tmp_path / "profile", DESKTOP)[1]
     # The policy keeps a script from a page that is not its own.
     own = (site / "mine" / "index.html").read_text()
     page.write_text(own.replace("</body>", "<script>document.title = 'other'</script></body>"))
@@ -185,7 +203,7 @@ def test_rows_are_chosen_and_sorted_and_the_figure_follows(whole_site: Path, tmp
     path = whole_site / "default" / "index.html"
     commit = read_head(Path(__file__).parents[3] / "results" / "default" / "cases.csv")["commit"]
     assert browsed(path, tmp_path / "profile", DESKTOP)[1] == []
-    found = measured(path, tmp_path, USE, DESKTOP)
+    (found,) = measured([path], tmp_path, USE, DESKTOP)
     assert found["systems"] == [found["system"]]
     assert 0 < found["chosen"] < found["all"]
     assert found["count"] == f"{found['chosen']} of {found['all']} rows"
@@ -212,7 +230,11 @@ def test_rows_are_chosen_and_sorted_and_the_figure_follows(whole_site: Path, tmp
 
 @pytest.mark.slow
 def test_every_page_loads_without_a_complaint_and_fits_both(whole_site: Path, tmp_path: Path) -> None:
-    for path in sorted(whole_site.rglob("*.html")):
-        assert browsed(path, tmp_path / "profile", DESKTOP)[1] == []
-        looks_right(path, tmp_path, DESKTOP)
-        looks_right(path, tmp_path, PHONE, dark=True)
+    pages = sorted(whole_site.rglob("*.html"))
+    for first in range(0, len(pages), TOGETHER):
+        some = pages[first : first + TOGETHER]
+        every = tmp_path / "every.html"
+        every.write_text(framed([path.as_uri() for path in some], DESKTOP))
+        assert browsed(every, tmp_path / "profile", DESKTOP)[1] == []
+        look_right(some, tmp_path, DESKTOP)
+        look_right(some, tmp_path, PHONE, dark=True)
