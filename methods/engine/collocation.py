@@ -12,6 +12,7 @@ roughness.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -55,6 +56,11 @@ class Curves:
     maps: tuple[scipy.sparse.csr_array, ...]
     values: tuple[ndarray, ...]
     rough: scipy.sparse.csr_array | None
+
+    @functools.cached_property
+    def grams(self) -> tuple[scipy.sparse.csr_array, ...]:
+        """The maps' normal matrices, which no step changes."""
+        return tuple(m.T @ m for m in self.maps)
 
     @property
     def each(self) -> int:
@@ -249,7 +255,7 @@ def normal_equations(
 
 def _data_matrix(curves: Curves, sigma: ndarray) -> Any:
     """Return the part of the normal matrix that comes from the samples and the roughness."""
-    total = sum((m.T @ m) / s**2 for m, s in zip(curves.maps, sigma, strict=True))
+    total = sum(gram / s**2 for gram, s in zip(curves.grams, sigma, strict=True))
     if curves.rough is not None:
         total = total + (curves.rough.T @ curves.rough) * (ROUGHNESS / sigma[0] ** 2)
     return total
