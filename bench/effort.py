@@ -1,7 +1,7 @@
 """How much a suite or a simulation asks for, as far as one can know before: what is absurd is refused unless confirmed.
 
-Counted are cases, the memory that the samples take at least, and the time that is simulated. How long a fit takes
-nobody knows before; its time limit is the most that it may.
+Counted are cases, the memory that the samples take at least, and the time that is simulated. How long a fit takes is
+known where it ran before (`bench.estimate`); elsewhere its time limit is the most that it may.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ MOST_CASES = 10**6
 MOST_TIME = 1e5
 # Hours that all cases may take together, by their limits, on as many workers as are asked for: a year.
 MOST_HOURS = 8760
+# Hours of work, by what the same cases took before, that nobody starts in passing.
+MOST_KNOWN_HOURS = 5
 TOLD_HOURS = 1
 # u as it is and as it is seen, and its rate, in bytes of double precision.
 BYTES_OF_A_VALUE = 24
@@ -75,6 +77,18 @@ def check_hours(most: float, where: str) -> None:
     """
     if most > MOST_HOURS:
         raise InputError(f"{where}: by its time limits it may take {most:.0f} hours on these workers; {CONFIRM}")
+
+
+def check_known_hours(known: float, where: str) -> None:
+    """Refuse more than MOST_KNOWN_HOURS.
+
+    Raises:
+        InputError: there are more.
+    """
+    if known > MOST_KNOWN_HOURS:
+        raise InputError(
+            f"{where}: by what its cases took before it takes {known:.1f} hours on these workers; {CONFIRM}"
+        )
 
 
 def _rounded(number: int) -> str:

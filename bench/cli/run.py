@@ -6,7 +6,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,7 +19,6 @@ from latticebench.systems.errors import InputError, printable
 from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
-    from latticebench.bench.case import Case
     from latticebench.bench.executors.cluster import Place
     from latticebench.bench.executors.executor import Executor
     from latticebench.bench.run import Tally
@@ -92,7 +91,7 @@ def run(
     if dry_run:
         _tell_estimate(loaded, part, jobs, folder, retry, as_json)
         return
-    _tell_hours(suite, loaded.cases[part.first - 1 :: part.step], jobs, yes)
+    _tell_hours(suite, loaded, part, jobs, folder, retry, yes)
     store = create(folder)
     about = {"command": command_line(), **loaded.about, "chosen": str(choice)}
     with _executor(where, loaded, folder, jobs, any_processor) as one:
@@ -219,20 +218,28 @@ def _tell_estimate(suite: Suite, part: Shard, jobs: int, folder: Path, retry: bo
     print("nothing was run or written")
 
 
-def _tell_hours(suite: str, cases: Sequence[Case], jobs: int, yes: bool) -> None:
-    """Say how long cases may take, and ask for a confirmation where that is absurd.
+def _tell_hours(where: str, suite: Suite, part: Shard, jobs: int, folder: Path, retry: bool, yes: bool) -> None:
+    """Say how long cases may take, and ask for a confirmation where that is much.
 
     Raises:
         InputError: it is, and there is none.
     """
-    from latticebench.bench.effort import TOLD_HOURS, check_hours, hours
+    from latticebench.bench.effort import TOLD_HOURS, check_hours, check_known_hours, hours
+    from latticebench.bench.estimate import estimate, seconds_of
 
-    most = hours(cases, jobs)
+    cases = suite.cases[part.first - 1 :: part.step]
+    most, known = hours(cases, jobs), sum(seconds_of(suite, folder).values()) / jobs / 3600
+    if known > TOLD_HOURS:
+        # Some of them may be finished, which takes longer to find out.
+        known = estimate(suite, cases, folder, retry=retry).seconds(jobs) / 3600
     if not yes:
-        check_hours(most, suite)
-    if most > TOLD_HOURS:
+        check_hours(most, where)
+        check_known_hours(known, where)
+    if known > TOLD_HOURS:
+        print(f"{shown(where)}: about {known:.1f} hours, by what its cases took before", file=sys.stderr)
+    elif most > TOLD_HOURS:
         told = f"{most:.0f} hour{'s' * (round(most) != 1)}"
-        print(f"{shown(suite)}: at most {told}, if every case needs all of its time limit", file=sys.stderr)
+        print(f"{shown(where)}: at most {told}, if every case needs all of its time limit", file=sys.stderr)
 
 
 def shard_of(text: str | None, cases: int) -> Shard:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from commandline import latticebench, refused
 from latticebench.bench import kinds
 from latticebench.bench.case import Case, Folders
 from latticebench.bench.choice import chosen
@@ -269,6 +270,25 @@ def test_an_estimate_is_what_the_same_cases_took_before(path: str, tmp_path: Pat
     fresh = load(path, choice=chosen(["phi4*"], ["floor"], "7"))
     assert estimate(fresh, fresh.cases, tmp_path / "store").seconds(2) == 4 * 15 / 2
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.sqlite")} == before
+
+
+def test_hours_of_work_are_told_and_need_a_confirmation(path: str, tmp_path: Path) -> None:
+    suite, store, made = load(path), create(tmp_path / "store"), {"commit": "abc", "date": "", "machine": "m"}
+    store.plan({one.identity: f"old {k}" for k, one in enumerate(suite.cases)}, {})
+    took = 2 * 3600.0
+    for k, case in enumerate(suite.cases):
+        store.put(f"old {k}", case, {**outcome(case, "ok"), "seconds": took, "cpu_seconds": took}, made)
+    count, options = len(suite.cases), (path, "--results", "store", "--jobs", 1)
+    line = refused("run", *options, cwd=tmp_path)
+    assert f"took before it takes {2 * count}.0 hours" in line
+    assert "--yes" in line
+    code, _, err = latticebench("run", *options, "--shard", f"1/{count}", cwd=tmp_path)
+    assert (code, "about 2.0 hours" in err) == (0, True)
+    code, _, err = latticebench("run", *options, "--yes", cwd=tmp_path)
+    assert (code, "hours, by what" in err) == (0, True)
+    # What is finished takes no time.
+    code, _, err = latticebench("run", *options, cwd=tmp_path)
+    assert (code, "hours, by what" in err) == (0, False)
 
 
 def test_an_estimate_counts_what_is_finished_and_takes_published_times(here: None, tmp_path: Path) -> None:
