@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -22,9 +23,14 @@ EXACT = [
 ]
 
 
+@functools.cache
+def motion(name, sites=None):
+    return simulate(systems.find(name), sites=sites)
+
+
 def seen(name, noise, seed, *, velocities=True, missing=0.0, ends=None, **options):
     system = systems.find(name)
-    clean = simulate(system, **options)
+    clean = simulate(system, **options) if options.keys() - {"sites"} else motion(name, **options)
     found = observe(clean, np.random.default_rng(seed), noise=noise, missing=missing).observed()
     return replace(found, v=found.v if velocities else None, ends=ends or system.ends)
 
