@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -12,6 +13,9 @@ from latticebench.bench.tree import Tree, end
 # Nothing is imported from the working folder.
 START = "import sys; sys.path[:] = sys.argv[1].split('\\n'); from latticebench.bench.guardian import watch; watch()"
 
+# Seconds within which it has ended what was left.
+PATIENCE = 60.0
+
 
 class Guardian:
     """The runner's end of it; a context that ends it."""
@@ -19,7 +23,11 @@ class Guardian:
     def __enter__(self) -> Guardian:
         """Start it."""
         command = [sys.executable, "-c", START, search_path()]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+        # It must not hold open what the run prints to.
+        nowhere = subprocess.DEVNULL
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=nowhere, stderr=nowhere, start_new_session=True
+        )
         return self
 
     def watch_over(self, tree: Tree) -> None:
@@ -43,7 +51,14 @@ class Guardian:
         assert self.process.stdin is not None
         with suppress(OSError):
             self.process.stdin.close()
-        self.process.wait()
+        # A case may have found and stopped it.
+        if hasattr(signal, "SIGCONT"):
+            self.process.send_signal(signal.SIGCONT)
+        try:
+            self.process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 def search_path() -> str:

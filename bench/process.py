@@ -32,6 +32,8 @@ START = "import sys; sys.path[:] = sys.argv[1].split('\\n'); from latticebench.b
 START_LIMIT = 120.0
 # Seconds within which a case is so quick that another one may wait behind it.
 QUICK = 0.1
+# Lines of a worker that may wait to be taken: that it has begun, and two results. One that writes more waits itself.
+WAITING = 3
 # Characters of what a case has printed that are shown in its row; bytes that are kept of it while it runs.
 MOST_SHOWN = 200
 MOST_PRINTED = 2**20
@@ -52,7 +54,8 @@ class Process:
         self.code = code
         self.cases: deque[Case] = deque()
         self.number, self.since, self.begun = 1, 0.0, False
-        self.quick = self.last = False
+        self.quick = self.last = self.silent = False
+        self.room = threading.Semaphore(WAITING)
         # Where in the file what the present case prints begins, and what of it is in the file no more.
         self.place, self.kept = 0, ""
         mark = uuid.uuid4().hex
@@ -85,7 +88,8 @@ class Process:
         assert self.process.stdout is not None
         # A line that is longer than a result can be is cut, and then none.
         with self.process.stdout as answers, contextlib.suppress(OSError):
-            while line := answers.readline(2 * MOST_BYTES):
+            while not self.closed and (line := answers.readline(2 * MOST_BYTES)):
+                self.room.acquire()
                 events.put((self, line))
         events.put((self, b""))
 
@@ -119,6 +123,8 @@ class Process:
 
     def take(self, line: bytes) -> tuple[Case, dict[str, Any]] | None:
         """Take a line that the worker has answered; return the case and its result where it is one."""
+        self.room.release()
+        self.silent = self.silent or not line
         if self.closed or not self.cases or not line:
             return None
         try:
@@ -129,7 +135,7 @@ class Process:
                 self._is(replace(self.tree, worker=int(told["worker"])))
                 return None
             if told["done"] != self.number:
-                return None
+                raise ValueError("of another case")
             result, clean, printed = dict(told["result"]), bool(told["clean"]), int(told["printed"])
             blank = outcome(self.cases[0], "ok")
             if result.keys() != blank.keys() or result["status"] not in STATUSES or type(result["reason"]) is not str:
@@ -145,6 +151,9 @@ class Process:
             return None
         case, code = self.cases[0], self.process.poll()
         limit = case.time_limit if self.begun else START_LIMIT
+        if code is None and self.silent and hasattr(signal, "SIGCONT"):
+            # A worker that has ended may have stopped its shield before, which then cannot tell.
+            self.process.send_signal(signal.SIGCONT)
         if code is not None:
             return self._finish(outcome(case, "died", f"the worker process ended by itself ({_told(code)})"))
         if time.monotonic() - self.since > limit:
@@ -210,6 +219,7 @@ class Process:
         with contextlib.suppress(OSError):
             self.process.stdin.close()
         self.printed.close()
+        self.room.release()
         # It ends with the last process that could write to it.
         self.listener.join(timeout=1)
 

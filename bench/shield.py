@@ -32,11 +32,14 @@ def serve() -> None:
 
 def _end_as(worker: int) -> None:
     """Wait for the end of the worker, end what it has left behind, and end in the same way."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     # The pipes are the worker's, and end with it.
     os.close(0)
     os.close(1)
     _, status = os.waitpid(worker, 0)
-    end_descendants(os.getpid())
+    # Whatever it has done to this process, such as to its limits, must not hide how it ended.
+    with suppress(Exception):
+        end_descendants(os.getpid())
     if os.WIFSIGNALED(status):
         _kill_itself(os.WTERMSIG(status))
     os._exit(os.WEXITSTATUS(status))

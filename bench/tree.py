@@ -36,6 +36,14 @@ def adopt_orphans() -> None:
         ctypes.CDLL(None).prctl(ADOPT_ORPHANS, 1, 0, 0, 0)
 
 
+def bury_orphans() -> None:
+    """Take what is left of adopted processes that have ended off the system's list."""
+    if hasattr(os, "WNOHANG"):
+        with contextlib.suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+
+
 @dataclass(frozen=True)
 class Tree:
     """The processes of a worker.

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 from latticebench.bench.case import Case, Folders
 from latticebench.bench.memory import memory_limit
-from latticebench.bench.tree import adopt_orphans
+from latticebench.bench.tree import adopt_orphans, bury_orphans
 from latticebench.methods.method import Skipped
 from latticebench.systems.errors import InputError
 from latticebench.systems.user_files import raised
@@ -47,6 +47,7 @@ def serve() -> None:
         # A copy of this process that the case has made ends here.
         if os.getpid() != own:
             os._exit(0)
+        bury_orphans()
         printed = os.fstat(2).st_size
         clean = threading.active_count() <= threads
         _answer(answers, {"done": number, "result": result, "clean": clean, "printed": printed})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import textwrap
@@ -14,6 +15,7 @@ from typing import Any
 import psutil
 import pytest
 
+from latticebench.bench.guardian import Guardian
 from latticebench.bench.run import run
 from latticebench.bench.store import create
 from latticebench.bench.suite import load
@@ -88,6 +90,14 @@ DEEDS: dict[str, tuple[str, str, str, str]] = {
     ),
     "kills its parent": ("", "os.kill(os.getppid(), 9)\ntime.sleep(3600)", "died", "SIGKILL"),
     "kills its group": ("", "os.killpg(0, 9)", "died", "SIGKILL"),
+    "interrupts its parent": ("", "os.kill(os.getppid(), 2)\ntime.sleep(3600)", "died", "itself (SIGINT)"),
+    "stops its parent and ends": ("", "os.kill(os.getppid(), signal.SIGSTOP)\nos._exit(3)", "died", "exit code 3"),
+    "floods the answers": (
+        "",
+        "while True:\n    for k in range(3, 9):\n        try: os.write(k, b'{{\"done\":0}}\\n' * 5000)\n"
+        "        except OSError: pass",
+        "failed", "no result",
+    ),
     "stops its parent": ("", "os.kill(os.getppid(), signal.SIGSTOP)", "ok", ""),
     "children eat": (
         "", "many = [sleeper(eats=2**29) for _ in range(2)]\nmany[0].wait()", "memory", "900 MiB",
@@ -106,8 +116,8 @@ DEEDS: dict[str, tuple[str, str, str, str]] = {
 
 # Each starts a worker of its own; the others are of the same kinds, or in `test_run.py`, where one does for several.
 QUICK = (
-    "prints when imported", "leaves a session", "leaves an orphan", "hides", "kills its parent", "children eat",
-    "floods", "answers itself",
+    "prints when imported", "leaves a session", "leaves an orphan", "hides", "kills its parent",
+    "stops its parent and ends", "children eat", "floods", "answers itself", "floods the answers",
 )  # fmt: skip
 
 
@@ -164,6 +174,23 @@ def test_every_hostile_method_is_a_row_with_its_reason_and_nothing_of_it_is_left
 @pytest.mark.slow
 def test_hostile_methods_of_many_more_kinds_are_rows_and_leave_nothing(tmp_path: Path, groups: bool) -> None:
     every_one_is_a_row(tmp_path, list(DEEDS), groups)
+
+
+def test_what_ends_behind_a_case_is_not_left_as_a_zombie(tmp_path: Path) -> None:
+    count = "print('zombies', sum(one.status() == 'zombie' for one in psutil.Process().children()))"
+    left = "subprocess.run(['sh', '-c', 'true & true & true'])\ntime.sleep(0.2)"
+    body = METHOD.format(marker="none", before="import psutil", within=textwrap.indent(f"{count}\n{left}", " " * 8))
+    (tmp_path / "m.py").write_text(body)
+    text = '[methods.a]\nmethod = "m.py"\n[[grid]]\nsystem = "phi4"\nlibraries = ["lib1"]\nseeds = [1, 2, 3]\n'
+    (tmp_path / "s.toml").write_text(text + "noise = 0.01\nsites = 5\nsamples = 8\nspan = 1.0\n")
+    results, _ = run(load(str(tmp_path / "s.toml")), create(tmp_path / "store"), jobs=1)
+    assert [(one["status"], one["reason"]) for one in results] == [("ok", "printed: zombies 0")] * 3
+
+
+def test_a_guardian_that_was_stopped_does_not_hold_up_the_end() -> None:
+    with Guardian() as guardian:
+        guardian.process.send_signal(signal.SIGSTOP)
+    assert guardian.process.poll() == 0
 
 
 def test_a_killed_run_leaves_no_process_of_a_method_behind(tmp_path: Path) -> None:
