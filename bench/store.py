@@ -414,11 +414,17 @@ def _keep_journal(connection: sqlite3.Connection) -> None:
 
 
 def _check(connection: sqlite3.Connection, path: Path, fresh: bool) -> None:
-    # In this order: another run may be making the tables and, after them, the mark.
-    names = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
-    application, version = (
-        connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
-    )
+    # Another run may be making it: all of this is of one moment.
+    connection.execute("BEGIN")
+    try:
+        names = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
+        application, version = (
+            connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
+        )
+    finally:
+        # A file that is damaged may have ended it.
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
     if fresh and not names and not application:
         return
     if application != APPLICATION:

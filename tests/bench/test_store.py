@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -236,3 +237,10 @@ def test_a_full_disk_is_one_clear_line_and_leaves_nothing_half_written(tmp_path:
     store = open_store(tmp_path / "store")
     assert len(list(store.results())) == 50
     assert next(store.read("SELECT COUNT(*) FROM results")) == (50,)
+
+
+def test_runs_that_make_a_store_at_the_same_moment_all_have_it(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        for number in range(50):
+            stores = list(pool.map(create, [tmp_path / str(number)] * 4))
+            assert {one.path for one in stores} == {tmp_path / str(number) / FILE}
