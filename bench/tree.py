@@ -91,9 +91,9 @@ def resident_mib(tree: Tree, *, whole: bool) -> float:
 def end(tree: Tree) -> None:
     """End a worker with all that it has started, whatever they are doing; some of them may have ended before."""
     leaders = _leaders(tree)
+    # The worker, or its shield where that has ended: while it is held it adopts, and makes no more itself.
     for one in leaders[:1]:
         with contextlib.suppress(psutil.Error):
-            # While it is held it adopts, and makes no more itself.
             one.suspend()
     _end_all(lambda: started(tree))
     for one in leaders[:1]:
