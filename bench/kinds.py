@@ -44,13 +44,16 @@ class Kind:
     draw: Publisher
 
 
-def _fit(beside: Published | None = None) -> Kind:
+def _fit(beside: Published | None = None, *, spread: bool = True) -> Kind:
     from latticebench.bench import figures, publish
     from latticebench.bench.report.screen import show_results
     from latticebench.bench.tables import cases
 
     if beside is None:
-        return Kind(publish.TABLES, figures.FIGURES, cases, show_results, publish.publish, figures.draw_all)
+        return Kind(
+            publish.TABLES, figures.FIGURES, cases, functools.partial(show_results, spread=spread), publish.publish,
+            figures.draw_all,
+        )  # fmt: skip
 
     def table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
         return beside.joined(cases(results))
@@ -58,7 +61,7 @@ def _fit(beside: Published | None = None) -> Kind:
     def show(results: Iterable[Mapping[str, Any]], value: str) -> None:
         from latticebench.bench.report.screen import show_note, show_rows
 
-        arranged = publish.matrix(table(results), value)
+        arranged = publish.matrix(table(results), value, spread=spread)
         show_rows(list(arranged.columns), arranged.to_numpy().tolist())
         show_note(f"{value}: median over seeds; {beside.mark} published: {beside.about}")
 
@@ -92,7 +95,12 @@ KINDS: Mapping[str, Callable[[], Kind]] = {
 
 
 def each(
-    store: Store, shard: Shard = WHOLE, *, history: bool = False, beside: Published | None = None
+    store: Store,
+    shard: Shard = WHOLE,
+    *,
+    history: bool = False,
+    beside: Published | None = None,
+    spread: bool = True,
 ) -> Iterator[tuple[str, Kind, Results, dict[str, Any]]]:
     """Return each kind that a store has: its name, the kind, its results, and their description.
 
@@ -110,16 +118,32 @@ def each(
     for name in names:
         if name not in KINDS:
             raise InputError(f"{store.path}: it has cases of kind {name!r}, which this latticebench does not know")
-        yield name, _fit(beside) if name == "fit" else KINDS[name](), store.results(shard, name, history=history), about
+        kind = _fit(beside, spread=spread) if name == "fit" else KINDS[name]()
+        yield name, kind, store.results(shard, name, history=history), about
 
 
 def show(
-    store: Store, title: str = "", value: str = "e2", shard: Shard = WHOLE, beside: Published | None = None
+    store: Store,
+    title: str = "",
+    value: str = "e2",
+    shard: Shard = WHOLE,
+    beside: Published | None = None,
+    *,
+    spread: bool = True,
 ) -> None:
-    """Print the results of a store, and where they come from; those of fits beside published ones."""
+    """Print the results of a store, and where they come from; those of fits beside published ones.
+
+    Args:
+        store: the results.
+        title: what stands above them.
+        value: which score of fits.
+        shard: which part of the store.
+        beside: what was published of the fits.
+        spread: whether quantiles over the seeds and their number follow a median.
+    """
     from latticebench.bench.report.screen import console, show_note
 
-    found = list(each(store, shard, beside=beside))
+    found = list(each(store, shard, beside=beside, spread=spread))
     if title:
         console().print(printable(title), style="bold", highlight=False, markup=False)
     with store.sound():

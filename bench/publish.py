@@ -29,11 +29,12 @@ MOST_READ = 1000
 LEADING = re.compile(r"(inf|\d+(?:\.\d+)?(?:e[+-]\d+)?)(?: |$)")
 
 
-def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
+def matrix(table: pd.DataFrame, value: str = "e2", *, spread: bool = True) -> pd.DataFrame:
     """Arrange the summary as part, data and library against method; a cell without a figure says why.
 
     A cell is the median over the seeds; where there are several, their 10 % and 90 % quantiles and number follow; of at
-    most five that is the least and the largest. The bound stands beside errors where it is known.
+    most five that is the least and the largest. Without `spread` it is the median alone. The bound stands beside errors
+    where it is known.
     """
     short = summary(table, value)
     if short.empty:
@@ -42,7 +43,7 @@ def matrix(table: pd.DataFrame, value: str = "e2") -> pd.DataFrame:
 
     def shown(row: pd.Series, state: str) -> str:
         figure = format_number(row[value])
-        if figure and row["seeds"] > 1:
+        if figure and spread and row["seeds"] > 1:
             low, high = (format_number(row[f"{value}_{end}"]) for end in ("low", "high"))
             return f"{figure} [{low}, {high}] n={row['seeds']}"
         if figure or state != "ok":

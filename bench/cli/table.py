@@ -35,6 +35,10 @@ def table(
         list[str] | None, typer.Option(help="Publish this table alone; may be given several times.")
     ] = None,
     beside: Beside = None,
+    spread: Annotated[
+        bool,
+        typer.Option("--spread/--no-spread", help="Show 10 % and 90 % quantiles and the number of seeds, too."),
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the tables of cases as JSON.")] = False,
 ) -> None:
     """Show the results of a run as a table, and publish them."""
@@ -62,7 +66,7 @@ def table(
     if as_json:
         print(document(store, beside=published), end="")
     else:
-        kinds.show(store, value=value, beside=published)
+        kinds.show(store, value=value, beside=published, spread=spread)
     for path in written:
         print(shown(path), file=sys.stderr if as_json else sys.stdout)
     if failures:

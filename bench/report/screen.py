@@ -133,14 +133,14 @@ def show_limit(
         console().print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def show_results(results: Iterable[Mapping[str, Any]], value: str = "e2") -> None:
+def show_results(results: Iterable[Mapping[str, Any]], value: str = "e2", *, spread: bool = True) -> None:
     """Print the results of fits: one score by data and method, and what went wrong."""
     from latticebench.bench.publish import matrix
     from latticebench.bench.tables import cases
 
     every = cases(results)
     screen = console()
-    arranged = matrix(every, value)
+    arranged = matrix(every, value, spread=spread)
     show_rows(list(arranged.columns), arranged.to_numpy().tolist())
     for _, row in every[~every["status"].isin(["ok", "skipped"])].iterrows():
         place = f"{row['data']} | {row['library']} | {row['method']} | seed {row['seed']}"

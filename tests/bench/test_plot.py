@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -254,6 +256,16 @@ def test_mp4_without_ffmpeg_is_refused_with_what_to_install(monkeypatch: pytest.
     with pytest.raises(InputError, match="install it"):
         animation.check_film(tmp_path / "a.mp4")
     animation.check_film(tmp_path / "a.gif")
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="there is no ffmpeg")
+def test_an_mp4_has_a_picture_for_each_row(run: Run, swings: Samples, tmp_path: Path) -> None:
+    write([swings], tmp_path / "swings.csv")
+    assert run("plot", "swings.csv", "--animate", "a.mp4")[0] == 0
+    command = ["ffmpeg", "-v", "error", "-i", str(tmp_path / "a.mp4"), "-f", "rawvideo", "-pix_fmt", "gray", "-"]
+    pictures = subprocess.run(command, capture_output=True, check=True).stdout
+    width, height = (round(side * animation.DENSITY) for side in animation.SIZE)
+    assert len(pictures) == len(swings.t) * width * height
 
 
 def test_the_page_of_a_fit_has_data_table_and_pictures_and_lets_nothing_run(swings: Samples) -> None:

@@ -78,6 +78,9 @@ def test_the_spread_holds_the_middle_of_the_seeds() -> None:
     assert (short["e2"], short["e2_low"], short["e2_high"], short["seeds"]) == (0.11, 0.03, 0.19, 21)
     alone = matrix(cases([result("a", 1, 0.1)]))
     assert list(alone["a"]) == ["0.1"]
+    several = cases([result("a", seed, seed / 100) for seed in range(1, 22)])
+    assert list(matrix(several)["a"]) == ["0.11 [0.03, 0.19] n=21"]
+    assert list(matrix(several, spread=False)["a"]) == ["0.11"]
 
 
 def test_the_coverage_is_the_share_of_intervals_that_hold_the_truth(tmp_path: Path) -> None:
