@@ -161,7 +161,8 @@ def normal(layout: Layout, error: ndarray, slope: ndarray, size: int, damping: f
 
 def scaled_inverse(gram: Float[ndarray, "pieces state state"], damping: float) -> tuple[ndarray, ndarray]:
     """Return scales, and the inverses of matrices that are divided by them on both sides and damped."""
-    unit = np.sqrt(np.maximum(np.einsum("pss->ps", gram), 1e-300))
+    # What no reading depends on has a scale, too, whose square is a number.
+    unit = np.sqrt(np.maximum(np.einsum("pss->ps", gram), 1e-200))
     scaled = gram / unit[:, :, None] / unit[:, None, :]
     scaled[:, np.arange(gram.shape[1]), np.arange(gram.shape[1])] += damping + 1e-11
     return unit, np.linalg.inv(scaled)

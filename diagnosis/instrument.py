@@ -1,9 +1,10 @@
-"""What readings say of the instrument that took them, before any equation: its step and the size of its noise."""
+"""What readings say of the instrument that took them, before any equation: whether it works, its step, its noise."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Shaped
     from numpy import ndarray
 
+    from latticebench.systems.samples import Samples
+
+# A sensor that has read one number so many times, while another's readings change, does not work.
+DEAD = 20
 # Levels that a step is looked for in; fewer may lie at equal distances by chance.
 FEWEST_LEVELS = 4
 # A range of more steps than this is printed with six digits, which is not the grid of a converter, unless it is coarse.
@@ -41,6 +46,35 @@ BANDS, FEWEST_LINES = 16, 8
 # A size within so many times the smallest that is looked for may be any smaller one.
 AT_LEAST = 1.1
 ROBUST = 1.4826  # standard deviation over median absolute value, of a Gaussian
+
+
+# Sensors that do not work ---------------------------------------------------------------------------------------------
+
+
+def dead_sensors(data: Sequence[Samples]) -> tuple[int, ...]:
+    """Return the sites whose sensors read one number all the time, while others' readings change.
+
+    Args:
+        data: recordings of one chain; a sensor works where it does in any of them.
+    """
+    fields = [np.concatenate([one.u for one in data])]
+    if all(one.v is not None for one in data):
+        fields.append(np.concatenate([one.v for one in data if one.v is not None]))
+    changes = np.any([np.any(field != _first(field), axis=0, where=np.isfinite(field)) for field in fields], axis=0)
+    still = np.flatnonzero(~changes & (np.sum(np.isfinite(fields[0]), axis=0) >= DEAD))
+    return tuple(still.tolist()) if np.any(changes) else ()
+
+
+def without(samples: Samples, sites: Sequence[int]) -> Samples:
+    """Return a recording without the readings of the sensors at some sites."""
+    kept = ~np.isin(np.arange(samples.sites), sites)
+    u, v = (None if field is None else np.where(kept, field, np.nan) for field in (samples.u, samples.v))
+    return samples if np.all(kept) or u is None else replace(samples, u=u, v=v)
+
+
+def _first(field: Shaped[ndarray, "time sites"]) -> Shaped[ndarray, " sites"]:
+    """Return the first reading of each sensor; NaN where there is none."""
+    return np.asarray(field[np.argmax(np.isfinite(field), axis=0), np.arange(field.shape[1])])
 
 
 # The step of a converter ----------------------------------------------------------------------------------------------

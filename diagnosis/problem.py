@@ -47,6 +47,8 @@ FINEST = 1e-6
 GAP = 2.0
 # In typical times between readings; each is some steps of the integrator.
 LONGEST_GAP = 1000.0
+# A gap of a sensor is interpolated where it has at most so many usual steps, or lasts half a period at most.
+HOLE = 8.0
 # The spectrum's grid has at most so many times, or four for each reading if that is more.
 MOST_GRID = 2**20
 # Dry friction is viscous at first below this share of the usual speed: a fit that is far from the motion needs forces
@@ -74,25 +76,14 @@ class Spectrum:
     def of(cls, samples: Samples) -> Spectrum:
         """Return the spectrum of a recording; missing and uneven readings are interpolated.
 
-        Only the longest stretch without a gap of more than LONGEST_GAP usual steps counts.
+        A sensor's gap in which it swings is not: a line through it is a slow motion that nobody has seen. The spectrum
+        is the sum of those of the longest stretches between such gaps.
         """
-        step = float(np.median(np.diff(samples.t)))
-        gaps = np.flatnonzero(np.diff(samples.t) > LONGEST_GAP * step) + 1
-        rows = max(np.split(np.arange(len(samples.t)), gaps), key=len)
-        t, u = samples.t[rows], samples.u[rows]
-        # Many shorter gaps, too, must not make a grid that no memory holds.
-        step = max(step, float(t[-1] - t[0]) / max(MOST_GRID, 4 * len(t)))
-        grid = np.arange(t[0], t[-1] + step / 2, step)
-        size = 4 * len(grid)
-        omega = 2 * np.pi * np.fft.rfftfreq(size, step)
-        total = np.zeros(len(omega))
-        for column in split_parts(u, samples.is_complex).reshape(len(t), -1).T:
-            seen = np.isfinite(column)
-            if np.sum(seen) < 4:
-                continue
-            even = np.interp(grid, t[seen], column[seen])
-            power = np.abs(np.fft.rfft((even - np.mean(even)) * np.hanning(len(even)), size)) ** 2
-            total += power / max(float(np.sum(power)), 1e-300)
+        few = HOLE * float(np.median(np.diff(samples.t)))
+        omega, total = _power(samples, few)
+        half = np.pi / float(omega[1 + np.argmax(total[1:])])
+        if half > few:
+            omega, total = _power(samples, half)
         floor = float(np.median(total[len(total) // 2 :]))
         inner = (total[1:-1] >= total[:-2]) & (total[1:-1] > total[2:])
         peaks = np.flatnonzero(inner) + 1
@@ -104,6 +95,32 @@ class Spectrum:
         k = int(np.searchsorted(self.omega, peak))
         low, high, beyond = np.log(self.power[k - 1 : k + 2])
         return float(peak + (self.omega[1] - self.omega[0]) * (low - beyond) / (2 * (low - 2 * high + beyond)))
+
+
+def _power(samples: Samples, gap: float) -> tuple[Float[ndarray, " frequencies"], Float[ndarray, " frequencies"]]:
+    """Return angular frequencies, and the mean power at them of the sensors' stretches without a longer gap."""
+    sensors = []
+    for column in split_parts(samples.u, samples.is_complex).reshape(len(samples.t), -1).T:
+        rows = np.flatnonzero(np.isfinite(column))
+        parts = np.split(rows, np.flatnonzero(np.diff(samples.t[rows]) > gap) + 1)
+        longest = max(map(len, parts))
+        # The lines of much shorter ones are too broad beside those of the longest.
+        sensors.append([(samples.t[part], column[part]) for part in parts if len(part) >= max(4, longest / 2)])
+    step = float(np.median(np.diff(samples.t)))
+    lasting = float(max((t[-1] - t[0] for one in sensors for t, _ in one), default=samples.t[-1] - samples.t[0]))
+    # Many shorter gaps, too, must not make a grid that no memory holds.
+    step = max(step, lasting / max(MOST_GRID, 4 * len(samples.t)))
+    size = 4 * len(np.arange(0, lasting + step / 2, step))
+    omega = 2 * np.pi * np.fft.rfftfreq(size, step)
+    total = np.zeros(len(omega))
+    for stretches in filter(None, sensors):
+        mean = np.mean(np.concatenate([values for _, values in stretches]))
+        power = np.zeros(len(omega))
+        for t, values in stretches:
+            even = np.interp(np.arange(t[0], t[-1] + step / 2, step), t, values) - mean
+            power += np.abs(np.fft.rfft(even * np.hanning(len(even)), size)) ** 2
+        total += power / max(float(np.sum(power)), 1e-300)
+    return omega, total
 
 
 @dataclass(frozen=True, eq=False)

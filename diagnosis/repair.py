@@ -17,7 +17,7 @@ from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.forecast import Prediction, pooled, predict
 from latticebench.diagnosis.horizon import unread
 from latticebench.diagnosis.inputs import in_words
-from latticebench.diagnosis.instrument import describe
+from latticebench.diagnosis.instrument import dead_sensors, describe, without
 from latticebench.diagnosis.modes import Mode
 from latticebench.diagnosis.problem import Problem, derivative_share
 from latticebench.diagnosis.progress import Found, Horizon
@@ -59,6 +59,7 @@ class Diagnosis:
         horizons: how the search went.
         left: what is significant in the last residual without having a name, the best first.
         data: recordings as they were used.
+        dead: sites whose sensors always read the same, which were not used.
         used: sample times that were used, and those recorded.
         noise: standard deviation of each sensor: u of site 1, ..., N, then v; NaN where nothing was read. It is what
             the last model leaves; where something is left in that, no more than the readings alone show.
@@ -93,6 +94,7 @@ class Diagnosis:
     declared: tuple[Float[ndarray, " terms"], Float[ndarray, " terms"]]
     modes: tuple[tuple[Mode, ...], tuple[Mode, ...], tuple[Mode, ...]]
     inputs: str = ""
+    dead: tuple[int, ...] = ()
     truth: Float[ndarray, " terms"] | None = None
 
     def against(self, truth: Float[ndarray, " terms"] | None) -> Diagnosis:
@@ -162,9 +164,12 @@ def diagnose(
     for one in shown:
         if not np.nanmax(np.abs(one.u - np.nanmean(one.u))) > 0:
             raise InputError(f"{one.source}: nothing moves; a diagnosis needs a motion")
+    dead = dead_sensors(shown)
+    shown, held_out = ([without(one, dead) for one in some] for some in (shown, held_out))
     # More threads than this are slower on matrices of these sizes.
     with threadpool_limits(1):
         problem = Problem.of(declared, order, shown, catalogue)
+        _check_outer(problem)
         _check_enough(problem)
         _check_room(problem)
         search = Search(problem, functools.partial(_say, data[0].source, watcher))
@@ -190,9 +195,10 @@ def diagnose(
             if found is None:
                 raise
             plain = Compared(found.models[0], (np.nan,) * len(found.models[0].model.effects), _none_equal(found))
-            raise Interrupted(_diagnosis(search.problem, found, plain, (), foreseen, recorded)) from None
+            known = _diagnosis(search.problem, found, plain, (), foreseen, recorded)
+            raise Interrupted(replace(known, dead=dead)) from None
         search.say("forecasting")
-        return _diagnosis(search.problem, found, best, left, foreseen, recorded)
+        return replace(_diagnosis(search.problem, found, best, left, foreseen, recorded), dead=dead)
 
 
 def _none_equal(found: Found) -> tuple[tuple[str, ...], ...]:
@@ -204,6 +210,24 @@ def _say(source: str, watcher: Watcher | None, text: str) -> None:
     log.info("%s: %s", source, text)
     if watcher is not None:
         watcher(text)
+
+
+def _check_outer(problem: Problem) -> None:
+    """Refuse recordings without readings of a site that unknown ends leave without an equation.
+
+    Raises:
+        InputError: there are none in any recording.
+    """
+    sites, moving = problem.chain.sites, problem.chain.moving
+    unread = [not any(np.any(np.isfinite(one.u[:, site])) for one in problem.data) for site in range(sites)]
+    for site in set(range(sites)).difference(moving):
+        if unread[site]:
+            first, last = (0, site) if site < moving[0] else (site, sites - 1)
+            raise InputError(
+                f"{problem.data[0].source}: u{site + 1} has no readings, or always the same; what a site near an "
+                f"unknown end does can only be read. Leave all columns from u{first + 1} to u{last + 1} out, or say "
+                "how the chain ends (--ends)"
+            )
 
 
 def _check_enough(problem: Problem) -> None:

@@ -26,6 +26,7 @@ from latticebench.bench import calls
 from latticebench.bench.overlay import of_diagnosis
 from latticebench.bench.report.rows import html_table
 from latticebench.diagnosis.cure import Cure, corrected, cure
+from latticebench.diagnosis.instrument import without
 from latticebench.exhibit import Exhibit
 from latticebench.pictures import FROM_PYTHON
 from latticebench.recording import Model, Recording
@@ -115,9 +116,12 @@ class Cause(Exhibit):
 
     @functools.cached_property
     def corrected(self) -> Recording:
-        """The recording as it would read without the offsets, drifts, factors and bends that were found."""
-        model = self.result.after.model
-        return Recording(tuple(corrected(model, one) for one in self.recording.samples))
+        """The recording as it would read without the offsets, drifts, factors and bends that were found.
+
+        A sensor that always reads the same has no readings in it.
+        """
+        model, dead = self.result.after.model, self.result.dead
+        return Recording(tuple(corrected(model, without(one, dead)) for one in self.recording.samples))
 
     @property
     def elsewhere(self) -> tuple[str, ...]:

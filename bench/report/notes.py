@@ -174,6 +174,14 @@ def notes(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
+    if diagnosis.dead:
+        names = diagnosis.data[0].origin.columns or [f"u{site + 1}" for site in range(diagnosis.data[0].sites)]
+        dead = [names[site] for site in diagnosis.dead]
+        more = f" and {len(dead) - NAMED} more" if len(dead) > NAMED else ""
+        yield (
+            f"{', '.join(dead[:NAMED])}{more}: always the same reading, which is taken for a sensor that does not "
+            "work; what it reads was left out, and its site moves as the equation says."
+        )
     for samples in _joined(diagnosis.data):
         for line in doubts([samples], diagnosis.before.model.declared):
             yield f"{samples.source}: {line}."

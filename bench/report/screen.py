@@ -69,7 +69,8 @@ def _text(value: Any) -> str:
 def show_warnings(warnings: Sequence[str]) -> None:
     """Print what is wrong with a result, before it."""
     for line in warnings:
-        console().print(f"Warning: {line}.", style="bold red", highlight=False, markup=False, soft_wrap=True)
+        stop = "" if line.endswith("?") else "."
+        console().print(f"Warning: {line}{stop}", style="bold red", highlight=False, markup=False, soft_wrap=True)
 
 
 def show_fit(fit: Fit, quality: Adequacy | None = None, units: Units = UNKNOWN) -> None:

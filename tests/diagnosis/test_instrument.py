@@ -1,4 +1,4 @@
-"""The step of a converter and the size of the noise, from readings alone, and the noise in words."""
+"""What readings alone say: which sensors do not work, the step of a converter, the noise and how it is put in words."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from latticebench.diagnosis.instrument import describe, of_readings, step_of
+from latticebench.diagnosis.instrument import DEAD, dead_sensors, describe, of_readings, step_of, without
 from latticebench.diagnosis.noise import Noise, Structure
+from latticebench.systems.samples import Samples
 
 NOISE = 0.03
 
@@ -20,6 +21,40 @@ def gaussian(count=500, seed=0):
 
 def waves(t, period, *, second=0.4):
     return np.sin(2 * np.pi * t / period + 0.3) + second * np.sin(2 * np.pi * t / (1.7 * period))
+
+
+# Sensors that do not work ---------------------------------------------------------------------------------------------
+
+
+def seen(*, still=(), at=0.3, count=40, seed=0, gone=(), **fields):
+    u = np.random.default_rng(seed).normal(size=(count, 4))
+    u[:, list(still)] = at
+    for cells in gone:
+        u[cells] = np.nan
+    return Samples(np.arange(float(count)), u, **fields)
+
+
+def test_a_sensor_that_always_reads_the_same_while_others_change_does_not_work():
+    assert dead_sensors([seen(still=[1, 3])]) == (1, 3)
+    assert dead_sensors([seen(still=[1, 3], gone=[slice(5), (7, 3)])]) == (1, 3)
+    assert dead_sensors([seen(still=range(4))]) == dead_sensors([seen()]) == ()
+    assert dead_sensors([seen(still=[1], count=DEAD - 1)]) == ()
+    assert dead_sensors([seen(still=[1], v=seen(seed=1).u)]) == ()
+    assert dead_sensors([seen(still=[1], v=seen(seed=1, still=[1]).u)]) == (1,)
+
+
+def test_a_sensor_works_that_changes_in_one_recording_or_between_two():
+    assert dead_sensors([seen(still=[1]), seen()]) == ()
+    assert dead_sensors([seen(still=[1]), seen(still=[1], at=0.4)]) == ()
+    assert dead_sensors([seen(still=[1]), seen(still=[1, 2])]) == (1,)
+
+
+def test_readings_that_are_left_out_are_missing_and_others_as_before():
+    one = seen(still=[1], v=seen(seed=1).u)
+    left = without(one, [1])
+    assert np.all(np.isnan(left.u[:, 1]) & np.isnan(left.v[:, 1]))
+    assert np.array_equal(left.u[:, [0, 2, 3]], one.u[:, [0, 2, 3]])
+    assert without(one, []) is one
 
 
 # The step of a converter ----------------------------------------------------------------------------------------------

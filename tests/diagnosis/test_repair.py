@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from latticebench.bench.report.notes import notes
 from latticebench.bench.trials.laboratory import make_recording
 from latticebench.bench.trials.laboratory.instruments import Kind
 from latticebench.bench.trials.laboratory.judging import findings, judge, written
@@ -233,6 +234,36 @@ def test_an_interruption_before_anything_is_known_goes_through():
 def swinging(count, size=1.0):
     t = 0.3 * np.arange(count)
     return Samples(t, size * np.cos(t)[:, None], source="swing.csv", ends="free")
+
+
+PHI4 = "u[n+1]+u[n-1]-2*u[n]; u[n]; u[n]**3"
+
+
+def with_one_level(site, value, ends):
+    """Nine sites of phi^4, of which one reads the same all the time."""
+    made = observe(simulate(find("phi4"), sites=9), np.random.default_rng(1), noise=0.01).observed()
+    u = made.u.copy()
+    u[:, site] = value
+    return replace(made, u=u, v=None, ends=ends, source="dead.csv")
+
+
+@pytest.mark.parametrize(("site", "ends"), [pytest.param(4, "free", id="inside"), slow(0, "free")])
+def test_what_a_dead_sensor_reads_changes_nothing_and_the_rest_is_diagnosed(site, ends):
+    dead, unread = (
+        diagnose(library("phi4", PHI4), 2, [with_one_level(site, value, ends)], CATALOGUE) for value in (0.3, np.nan)
+    )
+    assert (dead.dead, unread.dead) == ((site,), ())
+    assert (dead.verdict, dead.findings) == ("nothing missing", ())
+    assert np.array_equal(dead.declared, unread.declared)
+    assert np.abs(dead.declared[1] - [2, 2, -2]).max() < 0.05
+    assert any("does not work" in note for note in notes(dead))
+
+
+@pytest.mark.parametrize(("site", "from_", "to"), [(0, 1, 1), (1, 1, 2), (8, 9, 9)])
+@pytest.mark.parametrize("value", [0.3, np.nan])
+def test_a_site_near_an_unknown_end_must_be_read(site, from_, to, value):
+    with pytest.raises(InputError, match=rf"dead\.csv: u{site + 1} has no .* columns from u{from_} to u{to}"):
+        diagnose(library("phi4", PHI4), 2, [with_one_level(site, value, "unknown")], CATALOGUE)
 
 
 @pytest.mark.parametrize("count", [4, 8])
