@@ -161,9 +161,7 @@ def diagnose(
     """
     shown = [one.observed() if isinstance(one, SimulatedSamples) else one for one in data]
     check_fit(shown, declared, order)
-    for one in shown:
-        if not np.nanmax(np.abs(one.u - np.nanmean(one.u))) > 0:
-            raise InputError(f"{one.source}: nothing moves; a diagnosis needs a motion")
+    _check_motion(shown)
     dead = dead_sensors(shown)
     shown, held_out = ([without(one, dead) for one in some] for some in (shown, held_out))
     # More threads than this are slower on matrices of these sizes.
@@ -210,6 +208,12 @@ def _say(source: str, watcher: Watcher | None, text: str) -> None:
     log.info("%s: %s", source, text)
     if watcher is not None:
         watcher(text)
+
+
+def _check_motion(data: Sequence[Samples]) -> None:
+    for one in data:
+        if not np.nanmax(np.abs(one.u - np.nanmean(one.u))) > 0:
+            raise InputError(f"{one.source}: nothing moves; a diagnosis needs a motion")
 
 
 def _check_outer(problem: Problem) -> None:
