@@ -193,10 +193,9 @@ def diagnose(
             if found is None:
                 raise
             plain = Compared(found.models[0], (np.nan,) * len(found.models[0].model.effects), _none_equal(found))
-            known = _diagnosis(search.problem, found, plain, (), foreseen, recorded)
-            raise Interrupted(replace(known, dead=dead)) from None
+            raise Interrupted(_diagnosis(search.problem, found, plain, (), foreseen, recorded, dead)) from None
         search.say("forecasting")
-        return replace(_diagnosis(search.problem, found, best, left, foreseen, recorded), dead=dead)
+        return _diagnosis(search.problem, found, best, left, foreseen, recorded, dead)
 
 
 def _none_equal(found: Found) -> tuple[tuple[str, ...], ...]:
@@ -304,6 +303,7 @@ def _diagnosis(
     left: tuple[Left, ...],
     foreseen: Callable[[Fitted], list[Prediction]],
     recorded: int,
+    dead: tuple[int, ...],
 ) -> Diagnosis:
     """Return the diagnosis with the errors before and after."""
     before, after = found.before, best.fitted
@@ -329,7 +329,7 @@ def _diagnosis(
         criterion=(0.0, more * float(np.log(after.layout.readings())) - gain),
         declared=both(lambda one: np.array(one.model.coefficients[:count])),
         modes=(modes.of_recording(problem), modes.of_model(before), modes.of_model(after)),
-        inputs=in_words(problem),
+        inputs=in_words(problem), dead=dead,
     )  # fmt: skip
 
 
