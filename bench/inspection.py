@@ -29,6 +29,8 @@ ROUNDED = 0.5
 # Readings in a period, and periods in a record, below which little can be told.
 SPARSE, SHORT = 5.0, 3.0
 PEAKS = 5
+# A sensor was silent for long where it was for this share of the recording, in which others were read so many times.
+HOLE, FEW = 0.05, 8
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,8 @@ def _suspicious(
                 yield f"{one.name}: {count} readings of just {level:g} and none {end}; are they clipped?"
             if one.noise > 0 and one.step**2 / 12 > ROUNDED * one.noise**2:
                 yield f"{one.name}: readings come in steps of {one.step:.3g}; rounding makes most of the noise"
+        if (hole := _hole(samples, site)) is not None:
+            yield f"{one.name}: nothing was read from t = {hole[0]:g} to {hole[1]:g}, while others were"
         first = known.setdefault(_key(samples.u[:, site]), one.name)
         if one.readings and first != one.name:
             yield f"{one.name}: the same readings as {first}; is one a copy of the other?"
@@ -151,6 +155,17 @@ def _suspicious(
             yield f"{1 / max(peaks) / usual:.2g} readings in a period of the fastest line; {SPARSE:g} are few"
         if span * min(peaks) < SHORT:
             yield f"{span * min(peaks):.2g} periods of the slowest line; {SHORT:g} or more tell damping from noise"
+
+
+def _hole(samples: Samples, site: int) -> tuple[float, float] | None:
+    """Return between which readings a sensor was silent longest while others were read, if that is long."""
+    rows, others = np.flatnonzero(np.isfinite(samples.u[:, site])), np.any(np.isfinite(samples.u), axis=1)
+    if len(rows) < 2:
+        return None
+    first, last = rows[np.argmax(np.diff(samples.t[rows])) :][:2]
+    if samples.t[last] - samples.t[first] <= HOLE * np.ptp(samples.t) or np.sum(others[first + 1 : last]) < FEW:
+        return None
+    return float(samples.t[first]), float(samples.t[last])
 
 
 def _key(field: ndarray) -> bytes:

@@ -60,9 +60,11 @@ def _fit(beside: Published | None = None, *, spread: bool = True) -> Kind:
 
     def show(results: Iterable[Mapping[str, Any]], value: str) -> None:
         from latticebench.bench.report.screen import show_note, show_rows
+        from latticebench.bench.tables import ABOUT
 
         arranged = publish.matrix(table(results), value, spread=spread)
-        show_rows(list(arranged.columns), arranged.to_numpy().tolist())
+        keys = sum(name in ABOUT for name in arranged.columns)
+        show_rows(list(arranged.columns), arranged.to_numpy().tolist(), keys)
         show_note(f"{value}: median over seeds; {beside.mark} published: {beside.about}")
 
     return Kind(

@@ -102,10 +102,13 @@ def centred(field: ndarray) -> ndarray:
 def of_sensors(t: Float[ndarray, " time"], field: ndarray) -> tuple[Float[ndarray, " sites"], bool]:
     """Return the noise that each sensor shows by itself, at least SILENT of their size, and whether all is that.
 
-    See `latticebench.diagnosis.instrument.of_readings`; of complex readings it is the size per part.
+    See `latticebench.diagnosis.instrument.of_readings`; of complex readings it is the size per part. A sensor that
+    always reads the same, while others do not, shows none.
     """
     about = centred(field)
     shown = of_readings(t, about)
+    same = np.array([len(np.unique(one[np.isfinite(one)])) < 2 for one in field.T])
+    shown = np.where(same & ~np.all(same), np.nan, shown)
     square = np.nanmean(np.abs(about[:, np.any(np.isfinite(about), axis=0)]) ** 2, axis=0)
     least = SILENT * float(np.sqrt(np.max(square, initial=0.0)))
     told = np.isfinite(shown)

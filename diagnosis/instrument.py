@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -276,7 +275,7 @@ def describe(
     """Return the noise in words, a line for each sensor, or one line for all if they are alike.
 
     Args:
-        noise: to be described; sizes are said as standard deviations.
+        noise: to be described; sizes are said as standard deviations, and nothing of a sensor of which it is NaN.
         steps: step of each sensor's converter, 0 where there is none; what is fine beside the noise is not said.
         unit: of the readings.
         interval: time from one reading to the next; with it, the correlation over it is said.
@@ -284,9 +283,12 @@ def describe(
         time: unit of the times.
         span: length of the recording; with it, how far zeros wander is said.
     """
-    lines = []
+    lines: dict[int, str] = {}
     walks = noise.walk if len(noise.walk) else np.zeros(len(noise.size))
-    for size, memory, step, walk in zip(noise.deviation(), noise.memory, steps, walks, strict=True):
+    every = zip(noise.deviation(), noise.memory, steps, walks, strict=True)
+    for number, (size, memory, step, walk) in enumerate(every):
+        if np.isnan(size):
+            continue
         most = "at most " if size < AT_LEAST * least else ""
         parts = [f"{most}{two_digits(size)} {unit}".rstrip()]
         if step > COARSE * size:
@@ -300,10 +302,10 @@ def describe(
             parts.append(f"tails of Student's t with {two_digits(noise.tail)} degrees of freedom")
         if noise.growth > 0:
             parts.append(f"grows with the signal by {two_digits(100 * noise.growth)} %")
-        lines.append(", ".join(parts))
-    if len(lines) > 1 and all(one == other for one, other in itertools.pairwise(lines)):
-        return [f"all sensors: {lines[0]}"]
-    return [f"sensor {number}: {line}" for number, line in enumerate(lines, 1)]
+        lines[number] = ", ".join(parts)
+    if len(lines) > 1 and len(set(lines.values())) == 1:
+        return [f"all sensors: {next(iter(lines.values()))}"]
+    return [f"sensor {number + 1}: {line}" for number, line in lines.items()]
 
 
 def two_digits(value: float) -> str:

@@ -353,7 +353,9 @@ def _over(fitted: Fitted, noise: ndarray) -> float:
 
 def _noise_lines(problem: Problem, after: Fitted) -> tuple[str, ...]:
     noise, span = after.noise, problem.scene.span
-    return tuple(describe(noise, problem.steps, interval=problem.step, least=after.rows.least, span=span))
+    seen = np.any([np.any(one.seen, axis=(0, 2)) for one in problem.records], axis=0)
+    read = replace(noise, size=np.where(seen.ravel(), noise.size, np.nan))
+    return tuple(describe(read, problem.steps, interval=problem.step, least=after.rows.least, span=span))
 
 
 def _dynamics(problem: Problem, fitted: Fitted) -> float:

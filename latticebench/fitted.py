@@ -79,7 +79,7 @@ class Residual:
         return float(np.sqrt(np.nanmean(self.overlay.residual(name) ** 2)))
 
     def to_frame(self) -> pd.DataFrame:
-        """Return times and residuals, one column per site."""
+        """Return times and residuals, in the unit of the file (`Recording.to_frame` has that of the equation)."""
         columns = {f"u{site}": values for site, values in enumerate(self.values.T, 1)}
         return pd.DataFrame({"t": self.overlay.t, **columns})
 
@@ -211,13 +211,21 @@ class Fitted(Exhibit):
             t: times (T,); those of the recording if not given.
 
         Raises:
-            InputError: the ends are unknown, the equation has a measured input, or the motion grows without bound.
+            InputError: the ends are unknown, the field is not that of the chain, the equation has a measured input, or
+                the motion grows without bound.
         """
         if self.model.ends == "unknown":
             raise InputError('a chain with unknown ends cannot be simulated; give the model ends, such as ends="free"')
         if u is None:
             u, begun = self._start()
             v = begun if v is None else v
+        sites = self.data.samples[0].sites
+        for name, field in (("u", u), ("v", v)):
+            if field is not None and np.shape(field) != (sites,):
+                raise InputError(
+                    f"{name} has shape {np.shape(field)}: the chain has {sites} site{'s' * (sites > 1)}, one number "
+                    "each; times are given as t=..."
+                )
         start, times = np.asarray(u), np.asarray(self.data.samples[0].t if t is None else t, float)
         term = combination(self.result.library.terms, [float(value) for value in self.result.coefficients])
         chain = Motion(term, self.model.order, np.iscomplexobj(start), len(start), self.model.ends)

@@ -30,7 +30,7 @@ from latticebench.diagnosis.instrument import without
 from latticebench.exhibit import Exhibit
 from latticebench.pictures import FROM_PYTHON
 from latticebench.recording import Model, Recording
-from latticebench.systems.errors import InputError
+from latticebench.systems.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from latticebench.bench.limit import Design, Limit
@@ -286,6 +286,8 @@ def results(name: str | Path) -> Tables:
 
     folder = Path(name) if os.path.isdir(name) else folder_of(str(name))
     paths = sorted(folder.glob("*.csv"))
+    if not paths and folder_of("").is_dir() and os.sep not in str(name):
+        raise unknown("published run", str(name), {path.parent.name for path in folder_of("").glob("*/*.csv")})
     if not paths:
         raise InputError(
             f"{name}: there are no published tables; give a folder with .csv files of `latticebench table`"

@@ -75,6 +75,9 @@ def test_a_fit_gives_tables_intervals_and_a_simulation():
     assert found.latex.startswith(r"\ddot{u}_{n} = -")
     again = found.simulate([0.05], t=np.arange(0, 3, 0.1)).to_frame()
     np.testing.assert_allclose(again["u1"], 0.05 * np.cos(2 * again["t"]), atol=1e-3)
+    for wrong in ({"u": np.arange(0, 3, 0.1)}, {"u": [0.1], "v": [0.1, 0.2]}, {"v": 0.1}):
+        with pytest.raises(InputError, match=r"the chain has 1 sites?.*t=\.\.\."):
+            found.simulate(**wrong)
     assert "sin(u[n])" in repr(found)
     assert found._repr_html_().count("<table") == 1
     with pytest.raises(InputError, match="unknown ends"):
@@ -278,8 +281,10 @@ def test_tables_that_were_published_are_frames_of_numbers():
     found = lb.results("paper")
     assert found["cases"]["e2"].dtype.kind == "f"
     assert found._repr_html_().count("<tr") == len(found) + 1
+    with pytest.raises(InputError, match=r"unknown published run 'papr'; did you mean 'paper'\?"):
+        lb.results("papr")
     with pytest.raises(InputError, match="no published tables"):
-        lb.results("nothing")
+        lb.results("nothing/here")
 
 
 def test_a_recording_shows_itself_and_what_is_suspicious():

@@ -141,7 +141,7 @@ def _show(found: Contest) -> None:
     from latticebench.bench.report.screen import show_note, show_rows
 
     rows = readable(found.methods)
-    show_rows(list(rows.columns), rows.to_numpy().tolist())
+    show_rows(list(rows.columns), rows.to_numpy().tolist(), keys=1)
     show_note("per case: E2 smaller, larger, not told apart; ratio of E2, median over the cases with its 95 % interval")
     show_note(f"p: signed-rank test over the cases, corrected for {len(found.methods)} methods (Holm)")
     for cases in sorted(found.methods["cases"].unique()):

@@ -5,6 +5,7 @@ Residuals are in units of the noise, frequencies are angular ones (as in cos(ome
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
@@ -272,7 +273,8 @@ def _noise_lines(diagnosis: Diagnosis, units: Units) -> tuple[str, ...]:
     if not units.reading and units.scale == 1:
         return diagnosis.noise_lines
     first = diagnosis.data[0]
-    noise, interval = diagnosis.after.noise, float(np.median(np.diff(first.t)))
+    found, interval = diagnosis.after.noise, float(np.median(np.diff(first.t)))
+    noise = replace(found, size=np.where(np.isnan(diagnosis.noise), np.nan, found.size))
     fields = [first.u] if len(noise.size) == first.sites or first.v is None else [first.u, first.v]
     steps = [step_of(split_parts(one[:, k], first.is_complex).ravel()) for one in fields for k in range(first.sites)]
     span = max(float(one.t[-1] - one.t[0]) for one in diagnosis.data)

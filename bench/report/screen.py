@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 # Lines of what is said of a bound's noise, at most.
 MOST_LINES = 10
+# Characters between two columns of a table, and those that a column of names keeps where there is little room.
+GAP, NARROW = 3, 16
 MEANINGS = {"e2": "relative error of the coefficients, median over seeds"}
+SPREAD_MEANS = "; [10 %, 90 %] of n seeds, of at most five the least and the largest"
 
 
 def console() -> Console:
@@ -38,17 +41,44 @@ def console() -> Console:
     return Screen() if sys.stdout.isatty() else Screen(width=200)
 
 
-def show_rows(columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
-    """Print a table; lists and dictionaries within a cell are written out."""
+def show_rows(columns: Sequence[str], cells: Sequence[Sequence[Any]], keys: int = 0) -> None:
+    """Print a table; lists and dictionaries within a cell are written out.
+
+    Args:
+        columns: their names.
+        cells: of each row.
+        keys: how many columns say what a row is. With them, a table that is wider than the screen is printed in parts.
+    """
     from rich import box
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD)
-    for name in columns:
-        table.add_column(_shown(str(name)), overflow="fold")
-    for row in cells:
-        table.add_row(*(_shown(_text(value)) for value in row))
-    console().print(table)
+    screen = console()
+    heads, body = [str(name) for name in columns], [[_text(value) for value in row] for row in cells]
+    for part in _parts(heads, body, keys, screen.width):
+        table = Table(box=box.SIMPLE_HEAD)
+        for column in part:
+            # Names are broken before numbers are.
+            table.add_column(_shown(heads[column]), overflow="fold", no_wrap=0 < keys <= column and len(part) > keys)
+        for row in body:
+            table.add_row(*(_shown(row[column]) for column in part))
+        screen.print(table)
+
+
+def _parts(heads: Sequence[str], body: Sequence[Sequence[str]], keys: int, width: int) -> list[list[int]]:
+    """Return which columns stand beside each other: all, or with keys as many of the others as there is room for."""
+    from rich.cells import cell_len
+
+    longest = [max(cell_len(line) for row in (heads, *body) for line in row[k].split("\n")) for k in range(len(heads))]
+    room = width - GAP * (keys + 1) - sum(min(one, NARROW) for one in longest[:keys])
+    parts: list[list[int]] = [[]]
+    used = 0
+    for column in range(keys, len(heads)):
+        used += longest[column] + GAP
+        if keys and parts[-1] and used > room:
+            parts.append([])
+            used = longest[column] + GAP
+        parts[-1].append(column)
+    return [[*range(keys), *part] for part in parts]
 
 
 def _shown(text: str) -> RichText:
@@ -99,7 +129,7 @@ def show_limit(
 ) -> None:
     """Print a bound: warnings, each coefficient with its smallest error and a verdict, and what more would need."""
     show_warnings(warnings)
-    columns = ["term", "coefficient", "smallest error", "verdict"]
+    columns = ["term", "coefficient", "smallest error", "verdict, if it fitted" if warnings else "verdict"]
     every = zip(limit.library.texts, limit.coefficients, limit.stderr, limit.verdicts, strict=True)
     cells = [[text, f"{value:.6g}", f"{error:.2g}", verdict] for text, value, error, verdict in every]
     if units:
@@ -115,11 +145,12 @@ def show_limit(
         told = [*told[: MOST_LINES - 1], f"... and {len(told) - MOST_LINES + 1} lines more, in the JSON"]
     state = (
         f"{chr(10).join(told)}\n{limit.samples} samples, noise level {limit.noise:.3g}; the terms' conditioning is "
-        f"{limit.conditioning:.2g}\n"
-        f"All coefficients together can be known to {100 * limit.relative:.2g} % (root-mean-square of E2)."
+        f"{limit.conditioning:.2g}"
     )
+    if not warnings:
+        state += f"\nAll coefficients together can be known to {100 * limit.relative:.2g} % (root-mean-square of E2)."
     if warnings:
-        text = "What more readings would bring is told of an equation that fits."
+        text = "How well all can be known, and what more readings would bring, is told of an equation that fits."
     elif design.relative <= design.target:
         text = f"{wanted} is within reach as things are, up to a noise level of {design.noise:.2g}."
     else:
@@ -137,18 +168,20 @@ def show_limit(
 def show_results(results: Iterable[Mapping[str, Any]], value: str = "e2", *, spread: bool = True) -> None:
     """Print the results of fits: one score by data and method, and what went wrong."""
     from latticebench.bench.publish import matrix
-    from latticebench.bench.tables import cases
+    from latticebench.bench.tables import ABOUT, cases
 
     every = cases(results)
     screen = console()
     arranged = matrix(every, value, spread=spread)
-    show_rows(list(arranged.columns), arranged.to_numpy().tolist())
+    show_rows(
+        list(arranged.columns), arranged.to_numpy().tolist(), keys=sum(name in ABOUT for name in arranged.columns)
+    )
     for _, row in every[~every["status"].isin(["ok", "skipped"])].iterrows():
         place = f"{row['data']} | {row['library']} | {row['method']} | seed {row['seed']}"
         screen.print(
             printable(f"{row['status']}: {place}: {row['reason']}"), style="red", highlight=False, markup=False
         )
-    show_note(f"{value}: {MEANINGS.get(value, 'median over seeds')}")
+    show_note(f"{value}: {MEANINGS.get(value, 'median over seeds')}{SPREAD_MEANS if spread else ''}")
 
 
 def show_note(line: str) -> None:

@@ -11,7 +11,7 @@ from latticebench import methods
 from latticebench.bench import adequacy as judge
 from latticebench.bench.adequacy import adequacy
 from latticebench.bench.fitting import FitCase, samples
-from latticebench.bench.noise import left_by
+from latticebench.bench.noise import left_by, of_sensors
 from latticebench.methods.method import Fit, make, solve
 from latticebench.systems import find
 from latticebench.systems.lattice import library
@@ -133,6 +133,16 @@ def test_a_motion_that_runs_away_and_a_sensor_that_rests_are_no_obstacle():
     quality = adequacy([rests], Fit("any", PENDULA, 2, np.array([1.0, 500.0]), 0.0))
     assert not quality.fits
     assert np.isfinite(quality.work)
+
+
+def test_a_sensor_that_always_reads_the_same_shows_no_noise_to_measure_by():
+    data = pendula()
+    dead = Samples(data.t, np.column_stack([data.u[:, :1], np.full(len(data.t), 0.2)]), ends="free")
+    shown, silent = of_sensors(dead.t, dead.u)
+    assert shown[0] == of_sensors(data.t, data.u)[0][0]
+    assert np.isnan(shown[1])
+    assert not silent
+    assert not np.isnan(of_sensors(dead.t, dead.u[:, 1:])[0]).any()
 
 
 def long_chain():

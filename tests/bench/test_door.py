@@ -12,6 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.bench.cli import main
+from latticebench.bench.inspection import inspect
 from latticebench.bench.report.notes import resting
 from latticebench.systems.samples import Samples
 
@@ -238,3 +239,27 @@ def test_a_diagnosis_points_at_degrees_in_a_sine_and_at_a_sensor_that_stopped(ty
     notes = " ".join(json.loads((tmp_path / "d.json").read_text())["notes"])
     assert "in sin(...), which takes radians; if these are degrees: --scale deg." in notes
     assert "u2: 12.5 from t = 10 to 19.95, while others move" in notes
+
+
+def test_when_a_sensor_was_silent_for_long_is_told_and_a_few_missing_readings_are_not() -> None:
+    t = np.arange(0, 40, 0.1)
+    u = np.column_stack([np.cos(t), np.sin(1.3 * t)]) + 0.01 * np.random.default_rng(1).normal(size=(len(t), 2))
+    silent, single, both = (u.copy() for _ in range(3))
+    silent[100:180, 1] = np.nan
+    single[100:180:3, 1] = np.nan
+    both[100:180] = np.nan
+    told = "u2: nothing was read from t = 9.9 to 18, while others were"
+    assert told in inspect(Samples(t, silent)).suspicious
+    for other in (u, single, both):
+        assert not any("nothing was read" in line for line in inspect(Samples(t, other)).suspicious)
+
+
+def test_a_bound_for_an_equation_that_misfits_makes_no_promise(typed: Typed, tmp_path: Path) -> None:
+    t = np.arange(0, 40, 0.1)
+    noise = 0.001 * np.random.default_rng(1).normal(size=len(t))
+    for damping, promised in ((0.0, True), (0.05, False)):
+        swing = np.exp(-damping * t) * np.cos(2 * t) + noise
+        np.savetxt(tmp_path / "swing.csv", np.column_stack([t, swing]), "%.6f", ",", header="t,u1", comments="")
+        out = typed("limit", "swing.csv", "--terms", "u[n]", "--order", "2", "--ends", "free")[0]
+        assert ("can be known to" in out) == promised
+        assert ("verdict, if it fitted" in out) != promised

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -188,3 +189,6 @@ def test_sensors_that_are_alike_are_said_in_one_line():
     noise = Noise(np.full(3, 120.4), 0.0, np.inf, np.zeros(3), Structure())
     assert describe(noise, [0.0, 0.0, 0.01]) == ["all sensors: 120"]
     assert describe(noise, [0.0, 0.0, 200.0])[2] == "sensor 3: 120, steps of 200"
+    noise = replace(noise, size=np.array([120.4, np.nan, 120.4]))
+    assert describe(noise, [0.0, 9.0, 200.0]) == ["sensor 1: 120", "sensor 3: 120, steps of 200"]
+    assert describe(noise, [0.0, 9.0, 0.0]) == ["all sensors: 120"]
