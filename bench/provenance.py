@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import functools
 import itertools
 import os
 import platform
@@ -95,15 +94,12 @@ def commit() -> str:
     return head + ("+changes" if changed else "")
 
 
-@functools.cache
 def processor() -> str:
     """Return the name of the processor."""
-    import cpuinfo
-
-    # On some systems it asks programs, which may be missing or fail in ways of their own.
-    with suppress(Exception):
-        if name := cpuinfo.get_cpu_info().get("brand_raw"):
-            return str(name)
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
 
 

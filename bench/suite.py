@@ -39,6 +39,7 @@ recordings.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -58,13 +59,15 @@ from latticebench.bench.fitting import FitCase
 from latticebench.bench.grid import Contestant, Grid
 from latticebench.methods.method import check_fit, make, settings
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.files import check_regular
+from latticebench.systems.files import check_regular, read_bytes
 from latticebench.systems.lattice import System, library
 from latticebench.systems.samples import Samples
 from latticebench.systems.toml import read_toml
 
 HERE = Path(__file__).parent / "suites"
 ALL = Choice()
+# Of the hash of a file.
+DIGITS = 12
 # Parts of a suite that are named where nothing was chosen.
 LISTED = 12
 
@@ -112,12 +115,18 @@ class Suite:
     def about(self) -> dict[str, Any]:
         """What is told of it with its results: its name, and what each label stands for with all its settings.
 
-        Of others' code, which is imported by workers alone, these are the settings that are given.
+        Of others' code, which is imported by workers alone, these are the settings that are given; of a user's file,
+        the hash of its content, too.
+
+        Raises:
+            InputError: a user's file cannot be read.
         """
         written = {}
         for label, one in self.contestants.items():
             values: dict[str, Any] = dict(one.settings)
-            if code_file(one.method) is None and one.method not in methods.brought():
+            if (own := code_file(one.method)) is not None:
+                values["sha256"] = hashlib.sha256(read_bytes(self.folders.methods / own)).hexdigest()[:DIGITS]
+            elif one.method not in methods.brought():
                 kind = methods.find(one.method)
                 chosen = make(kind, one.settings)
                 values = {name: getattr(chosen, name) for name in settings(kind)}

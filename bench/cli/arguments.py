@@ -41,7 +41,7 @@ def asked(
         )
     if order is None:
         if known is None:
-            raise InputError("--order: 1 for du/dt, 2 for the second derivative")
+            raise InputError("give --order: 1 for du/dt, 2 for the second derivative")
         order = known.order
     return known, candidates, order
 

@@ -77,9 +77,13 @@ def words(page: str) -> str:
 def test_the_page_on_the_limit_says_what_the_table_of_efficiencies_says(script: Callable[[str], ModuleType]) -> None:
     counts = script("efficiency/efficiency.py")
     found, text = counts.measured(counts.load()), words("limit")
-    for part in counts.PARTS:
-        for method, group in found[found["part"] == part].groupby("method"):
-            assert f"`{method}` {counts.ends(group['efficiency'])}" in text, (part, method)
+    head = "| recordings |"
+    methods = re.findall(r"`(\S+)`", text[text.index(head) :].split(" |:--")[0])
+    assert set(methods) == set(found["method"])
+    for part, told in counts.PARTS.items():
+        own = dict(iter(found[found["part"] == part].groupby("method")["efficiency"]))
+        cells = [counts.ends(own[method]) if method in own else "not run" for method in methods]
+        assert f"| {told[0].lower()}{told[1:]} | {' | '.join(cells)} |" in text, part
 
 
 NAMED = "every effect named, alone or in its group, and no other"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import shutil
@@ -289,6 +290,15 @@ def test_a_method_that_writes_to_its_samples_harms_no_other(tmp_path: Path) -> N
     results, _ = finished(suite, create(tmp_path / "store"), jobs=1)
     assert [result["status"] for result in results] == ["failed", "ok"]
     assert "read-only" in results[0]["reason"]
+
+
+def test_what_is_told_of_a_users_method_has_the_hash_of_its_file(tmp_path: Path) -> None:
+    suite = hostile_suite(tmp_path, {"a": "seconds = 0.02"})
+    digest = hashlib.sha256((tmp_path / "hostile.py").read_bytes()).hexdigest()[:12]
+    assert suite.about["settings"] == {"a": f"hostile.py, seconds=0.02, sha256={digest}"}
+    (tmp_path / "hostile.py").unlink()
+    with pytest.raises(InputError, match=r"hostile\.py"):
+        _ = suite.about
 
 
 def test_a_table_shows_the_suite_that_was_run_last_and_where_each_result_came_from(tmp_path: Path) -> None:
