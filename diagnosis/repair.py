@@ -162,14 +162,10 @@ def diagnose(
     shown = [one.observed() if isinstance(one, SimulatedSamples) else one for one in data]
     check_fit(shown, declared, order)
     _check_motion(shown)
-    dead = dead_sensors(shown)
-    shown, held_out = ([without(one, dead) for one in some] for some in (shown, held_out))
     # More threads than this are slower on matrices of these sizes.
     with threadpool_limits(1):
-        problem = Problem.of(declared, order, shown, catalogue)
-        _check_outer(problem)
-        _check_enough(problem)
-        _check_room(problem)
+        problem, dead = _problem(declared, order, shown, catalogue)
+        held_out = [without(one, dead) for one in held_out]
         search = Search(problem, functools.partial(_say, data[0].source, watcher))
         found = None
 
@@ -209,6 +205,25 @@ def _say(source: str, watcher: Watcher | None, text: str) -> None:
         watcher(text)
 
 
+def _problem(
+    declared: Library, order: int, data: Sequence[Samples], catalogue: Sequence[Effect]
+) -> tuple[Problem, tuple[int, ...]]:
+    """Return the problem without the readings of sensors that do not work, and the sites of these.
+
+    Raises:
+        InputError: there are too few readings, or there is too little memory.
+    """
+    problem = Problem.of(declared, order, data, catalogue)
+    # Near an unknown end, what is read stands for what lies beyond: there, a site may be held.
+    dead = tuple(site for site in dead_sensors(data) if site in problem.chain.moving)
+    if dead:
+        problem = Problem.of(declared, order, [without(one, dead) for one in data], catalogue)
+    _check_outer(problem)
+    _check_enough(problem)
+    _check_room(problem)
+    return problem, dead
+
+
 def _check_motion(data: Sequence[Samples]) -> None:
     for one in data:
         if not np.nanmax(np.abs(one.u - np.nanmean(one.u))) > 0:
@@ -227,9 +242,8 @@ def _check_outer(problem: Problem) -> None:
         if unread[site]:
             first, last = (0, site) if site < moving[0] else (site, sites - 1)
             raise InputError(
-                f"{problem.data[0].source}: u{site + 1} has no readings, or always the same; what a site near an "
-                f"unknown end does can only be read. Leave all columns from u{first + 1} to u{last + 1} out, or say "
-                "how the chain ends (--ends)"
+                f"{problem.data[0].source}: u{site + 1} has no readings; what a site near an unknown end does can only "
+                f"be read. Leave all columns from u{first + 1} to u{last + 1} out, or say how the chain ends (--ends)"
             )
 
 

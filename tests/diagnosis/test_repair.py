@@ -260,10 +260,22 @@ def test_what_a_dead_sensor_reads_changes_nothing_and_the_rest_is_diagnosed(site
 
 
 @pytest.mark.parametrize(("site", "from_", "to"), [(0, 1, 1), (1, 1, 2), (8, 9, 9)])
-@pytest.mark.parametrize("value", [0.3, np.nan])
-def test_a_site_near_an_unknown_end_must_be_read(site, from_, to, value):
+def test_a_site_near_an_unknown_end_must_be_read(site, from_, to):
     with pytest.raises(InputError, match=rf"dead\.csv: u{site + 1} has no .* columns from u{from_} to u{to}"):
-        diagnose(library("phi4", PHI4), 2, [with_one_level(site, value, "unknown")], CATALOGUE)
+        diagnose(library("phi4", PHI4), 2, [with_one_level(site, np.nan, "unknown")], CATALOGUE)
+
+
+def test_sites_that_are_held_beside_an_unknown_end_are_what_they_read():
+    t = 0.1 * np.arange(300)
+    modes = np.sin(np.pi * np.outer([1, 2], np.arange(5)) / 4)
+    omega = np.sqrt(4 * (2 - 2 * np.cos(np.pi * np.array([1, 2]) / 4)))
+    u = (np.cos(np.outer(t, omega)) * [0.7, 0.4]) @ modes
+    u[:, 1:4] += 0.01 * np.random.default_rng(4).normal(size=(len(t), 3))
+    u[:, [0, 4]] = 0.0
+    coupling = "u[n+1]+u[n-1]-2*u[n]"
+    found = diagnose(library("springs", coupling), 2, [Samples(t, u, source="held.csv", ends="unknown")], CATALOGUE)
+    assert (found.dead, found.verdict) == ((), "nothing missing")
+    assert found.declared[1][0] == pytest.approx(4, rel=0.01)
 
 
 @pytest.mark.parametrize("count", [4, 8])
