@@ -31,10 +31,11 @@ import numpy as np
 
 from latticebench.methods.engine.bounds import Count, CountOrNone, Positive
 from latticebench.methods.engine.dynamics import split_parts
-from latticebench.methods.engine.networks.arrays import one_thread
+from latticebench.methods.engine.networks.arrays import Arrays, check_device, one_thread
 from latticebench.methods.engine.networks.hidden_layer import REDUNDANT, Activation, draw_layer
 from latticebench.methods.engine.networks.members import spread
-from latticebench.methods.engine.networks.stiffening import Stage, Training, first_stage, retrain, stiffen
+from latticebench.methods.engine.networks.side_by_side import Device
+from latticebench.methods.engine.networks.stiffening import Stage, Training, first_stage, minimise, retrain, stiffen
 from latticebench.methods.engine.networks.trained_curve import TrainedCurve, Weights, place_curve
 from latticebench.methods.engine.record import Record, prepare, without_halves
 from latticebench.methods.engine.starts import guess, smooth
@@ -85,6 +86,11 @@ class PINNGaussNewton:
         precision: it is also large enough when the standard errors are below this share of the coefficients.
         members: number of networks trained on samples drawn from the fit; 0 for none. `found` has the standard
             deviation of each coefficient over them, and the half-width of the interval of 95 % that follows from it.
+            On a device they take their steps together.
+        device: cpu, or a device of torch's such as cuda; cpu:0 is torch on the processor.
+
+    Raises:
+        InputError: there is no such device.
     """
 
     name: ClassVar[str] = "pinn-gn"
@@ -97,22 +103,26 @@ class PINNGaussNewton:
     tolerance: Positive = 0.05
     precision: Positive = 1e-7
     members: CountOrNone = 0
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Check what no bound says."""
+        check_device(self.device)
         if self.members == 1:
             raise InputError("setting members = 1: one has no spread, take 0, or 2 and more")
 
     @property
     def abilities(self) -> Abilities:
         """The method takes complex fields, inputs, uneven times and missing values."""
-        return Abilities(missing=True, loads=("scipy.linalg", "scipy.interpolate", "sympy"))
+        torch = () if self.device == "cpu" else ("torch",)
+        return Abilities(missing=True, loads=("scipy.linalg", "scipy.interpolate", "sympy", *torch))
 
     def fit(self, data: Sequence[Samples], library: Library, order: int, seed: int) -> Fit:
         """Train networks of growing size until the coefficients stand still.
 
         Raises:
-            InputError: the equation cannot be set up on the samples, or they are too few to start from.
+            InputError: the equation cannot be set up on the samples, they are too few to start from, or torch does not
+                have the device.
             Skipped: velocities were observed in some trajectories only.
         """
         if order == 2 and len({samples.v is None for samples in data}) > 1:
@@ -123,8 +133,9 @@ class PINNGaussNewton:
             frequency = _frequency(data, order)
             cuts = [self._pieces(samples, frequency) for samples in data]
             pieces = [piece for cut in cuts for piece in cut]
-            best, path = self._grown(pieces, library, order, frequency, seed)
-            drawn = self._members(best, seed)
+            device = None if self.device == "cpu" else Device(Arrays(self.device), pieces, library)
+            best, path = self._grown(pieces, library, order, frequency, seed, device)
+            drawn = self._members(best, seed, device)
         stage = best.stage
         found: dict[str, float | str] = {
             "weight": stage.weight, "units": float(max(len(one.a) for one in stage.weights)),
@@ -163,7 +174,7 @@ class PINNGaussNewton:
         return math.ceil(self.bandwidth * frequency * half / (REDUNDANT * math.pi / 2)) + FURTHER
 
     def _grown(
-        self, data: Sequence[Samples], library: Library, order: int, frequency: float, seed: int
+        self, data: Sequence[Samples], library: Library, order: int, frequency: float, seed: int, device: Device | None
     ) -> tuple[Trained, list[tuple[float, float, ndarray]]]:
         """Train networks of one size after another; return the best ones, and the way of all."""
         records = [prepare(samples, library.terms, order) for samples in data]
@@ -179,7 +190,7 @@ class PINNGaussNewton:
             ]
             curves = [curve for curve, _ in made]
             start = first_stage(curves, [weights for _, weights in made], coefficients)
-            stage, way = stiffen(curves, start, self._training, draw)
+            stage, way = stiffen(curves, start, self._training, draw, device.minimise if device else minimise)
             path += way
             better = best is None or (stage is not None and _better(stage, best.stage))
             if better:
@@ -224,18 +235,29 @@ class PINNGaussNewton:
         values = np.concatenate([*target, np.zeros((units, target[0].shape[1]))])
         return curve, Weights(theta, np.linalg.lstsq(matrix, values, rcond=None)[0])
 
-    def _members(self, best: Trained, seed: int) -> Float[ndarray, "member terms"]:
+    def _members(self, best: Trained, seed: int, device: Device | None) -> Float[ndarray, "member terms"]:
         """Train networks on samples drawn from the fit with its noise; return their coefficients."""
         draw = np.random.default_rng([seed, 1])
-        found = []
-        for _ in range(self.members):
-            curves = []
-            for curve, weights in zip(best.curves, best.stage.weights, strict=True):
-                fitted = curve.fitted(curve.layer(weights.theta), weights.a)
-                noisy = fitted + best.stage.sigma[:, None, None] * draw.normal(size=fitted.shape)
-                curves.append(replace(curve, value=np.where(curve.seen, noisy, 0.0)))
-            found.append(retrain(curves, best.stage, self._training))
-        return np.array(found)
+        fitted = [
+            curve.fitted(curve.layer(weights.theta), weights.a)
+            for curve, weights in zip(best.curves, best.stage.weights, strict=True)
+        ]
+        sigma = best.stage.sigma[:, None, None]
+        # Member by member, and of each member trajectory by trajectory.
+        noisy = [[one + sigma * draw.normal(size=one.shape) for one in fitted] for _ in range(self.members)]
+        seen = [
+            [np.where(curve.seen, one, 0.0) for curve, one in zip(best.curves, member, strict=True)] for member in noisy
+        ]
+        if device and seen:
+            together = [np.stack(values) for values in zip(*seen, strict=True)]
+            return device.retrain(best.curves, best.stage, self._training, together)
+        return np.array([
+            retrain(
+                [replace(curve, value=one) for curve, one in zip(best.curves, member, strict=True)],
+                best.stage, self._training,
+            )
+            for member in seen
+        ])  # fmt: skip
 
 
 def _frequency(data: Sequence[Samples], order: int) -> float:

@@ -12,14 +12,17 @@ Fourier features are drawn; Sitzmann et al., NeurIPS (2020), whose sines are tra
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
+
+    from latticebench.methods.engine.networks.arrays import Array
 
 Activation = Literal["sine", "tanh"]
 
@@ -34,24 +37,25 @@ class Move(NamedTuple):
     Attributes:
         numbers: of the layer, as a slice of theta.
         units: as a slice of all units.
-        levels: derivative of the units, and of their first and second time derivative, by their numbers (3, R, units).
+        levels: derivative of the units, and of their first and second time derivative, by their numbers
+            (3, ..., R, units).
     """
 
     numbers: slice
     units: slice
-    levels: Float[ndarray, "3 time unit"]
+    levels: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A layer evaluated at R times.
+    """A layer evaluated at R times, or those of several networks: `...` is nothing, or one axis of members.
 
     Attributes:
-        levels: the K units and their first and second time derivative (3, R, K).
+        levels: the K units and their first and second time derivative (3, ..., R, K).
         moves: their derivatives by theta.
     """
 
-    levels: Float[ndarray, "3 time unit"]
+    levels: Array
     moves: tuple[Move, ...]
 
 
@@ -74,45 +78,48 @@ def draw_layer(
     return np.concatenate([slopes, -slopes * draw.uniform(-1.1, 1.1, 2 * count)])
 
 
-def evaluate_layer(
-    activation: Activation, theta: Float[ndarray, " number"], tau: Float[ndarray, " time"], half: float
-) -> Layer:
+def evaluate_layer(activation: Activation, theta: Array, tau: Array, half: float, xp: Any = np) -> Layer:
     """Evaluate a layer.
 
     Args:
         activation: of the units.
-        theta: the layer's numbers.
+        theta: the layer's numbers (..., n).
         tau: scaled times (R,).
         half: half the span, in units of time.
+        xp: numpy, or torch for tensors.
     """
-    rate = 1 / half ** np.arange(3)[:, None, None]
     column = tau[:, None]
-    constant = np.zeros((3, len(tau), 1))
-    constant[0] = 1
-    levels, moves = (_sines if activation == "sine" else _bends)(theta, column)
-    scaled = tuple(move._replace(levels=move.levels * rate) for move in moves)
-    return Layer(np.concatenate([levels * rate, constant], axis=2), scaled)
+    constant = xp.ones_like(theta[..., :1][..., None, :] * column)
+    levels, moves = (_sines if activation == "sine" else _bends)(theta[..., None, :], column, xp)
+    scaled = tuple(move._replace(levels=_in_time(move.levels, half, xp)) for move in moves)
+    constants = xp.stack([constant, 0 * constant, 0 * constant])
+    return Layer(xp.concatenate([_in_time(levels, half, xp), constants], axis=-1), scaled)
 
 
-def _sines(w: ndarray, tau: ndarray) -> tuple[ndarray, tuple[Move, ...]]:
-    count = len(w)
-    c, s = np.cos(w * tau), np.sin(w * tau)
-    levels = np.stack([np.hstack([c, s]), np.hstack([-w * s, w * c]), np.hstack([-w * w * c, -w * w * s])])
-    by_cos = np.stack([-tau * s, -s - w * tau * c, -2 * w * c + w * w * tau * s])
-    by_sin = np.stack([tau * c, c - w * tau * s, -2 * w * s - w * w * tau * c])
+def _in_time(levels: Sequence[Array], half: float, xp: Any) -> Array:
+    """Return units and derivatives by tau as one array of units and derivatives by time."""
+    return xp.stack([one * (1 / half**level) for level, one in enumerate(levels)])
+
+
+def _sines(w: Array, tau: Array, xp: Any) -> tuple[Sequence[Array], tuple[Move, ...]]:
+    count = w.shape[-1]
+    c, s = xp.cos(w * tau), xp.sin(w * tau)
+    pairs = [(c, s), (-w * s, w * c), (-w * w * c, -w * w * s)]
+    by_cos = (-tau * s, -s - w * tau * c, -2 * w * c + w * w * tau * s)
+    by_sin = (tau * c, c - w * tau * s, -2 * w * s - w * w * tau * c)
     every = slice(0, count)
-    return levels, (Move(every, every, by_cos), Move(every, slice(count, 2 * count), by_sin))
+    moves = Move(every, every, by_cos), Move(every, slice(count, 2 * count), by_sin)
+    return [xp.concatenate(pair, axis=-1) for pair in pairs], moves
 
 
-def _bends(theta: ndarray, tau: ndarray) -> tuple[ndarray, tuple[Move, ...]]:
-    count = len(theta) // 2
-    w, shift = theta[:count], theta[count:]
-    h = np.tanh(w * tau + shift)
+def _bends(theta: Array, tau: Array, xp: Any) -> tuple[Sequence[Array], tuple[Move, ...]]:
+    count = theta.shape[-1] // 2
+    w, shift = theta[..., :count], theta[..., count:]
+    h = xp.tanh(w * tau + shift)
     first = 1 - h * h
     second = -2 * h * first
     third = (6 * h * h - 2) * first
-    levels = np.stack([h, w * first, w * w * second])
-    by_shift = np.stack([first, w * second, w * w * third])
-    by_w = np.stack([tau * first, first + w * tau * second, 2 * w * second + w * w * tau * third])
+    by_shift = (first, w * second, w * w * third)
+    by_w = (tau * first, first + w * tau * second, 2 * w * second + w * w * tau * third)
     every = slice(0, count)
-    return levels, (Move(every, every, by_w), Move(slice(count, 2 * count), every, by_shift))
+    return [h, w * first, w * w * second], (Move(every, every, by_w), Move(slice(count, 2 * count), every, by_shift))

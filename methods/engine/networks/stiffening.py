@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -97,14 +97,18 @@ class Reached:
     Attributes:
         stage: the minimum, without score.
         samples: sums of squares that are left of u and v.
-        equations: the last step's, of each network.
+        freedom: function that estimates the degrees of freedom that the networks take from u and v, from the noise of
+            both and random signs (levels, outputs, T, probes) for each network.
         steps: how many were taken.
     """
 
     stage: Stage
     samples: Float[ndarray, " levels"]
-    equations: Sequence[StepEquations]
+    freedom: Callable[[ndarray, Sequence[ndarray]], Float[ndarray, " levels"]]
     steps: int
+
+
+Minimise = Callable[[Sequence[TrainedCurve], Stage, Training], "Reached | None"]
 
 
 def first_stage(curves: Sequence[TrainedCurve], weights: Sequence[Weights], coefficients: ndarray) -> Stage:
@@ -119,7 +123,7 @@ def first_stage(curves: Sequence[TrainedCurve], weights: Sequence[Weights], coef
 
 
 def stiffen(
-    curves: Sequence[TrainedCurve], start: Stage, training: Training, draw: np.random.Generator
+    curves: Sequence[TrainedCurve], start: Stage, training: Training, draw: np.random.Generator, minimise: Minimise
 ) -> tuple[Stage | None, list[tuple[float, float, ndarray]]]:
     """Raise the weight from stage to stage.
 
@@ -128,6 +132,7 @@ def stiffen(
         start: where they are.
         training: how they are trained.
         draw: of the random signs.
+        minimise: takes the steps with one weight: `minimise` below, or that of a device.
 
     Returns:
         the stage that is taken, None where not even the first can be solved; and time (of `time.perf_counter`), score
@@ -142,13 +147,7 @@ def stiffen(
         reached = minimise(curves, now, training)
         if reached is None or (admitted and not reached.steps):
             break
-        used = sum(
-            (
-                step.freedom(curve, now.sigma, probe)
-                for curve, step, probe in zip(curves, reached.equations, signs, strict=True)
-            ),
-            np.zeros(len(counts)),
-        )
+        used = reached.freedom(now.sigma, signs)
         if admitted and np.sum(used) < STIFF * sum(curve.states for curve in curves):
             break
         used = np.clip(used, 0.0, 0.99 * counts)
@@ -233,7 +232,12 @@ def minimise(curves: Sequence[TrainedCurve], start: Stage, training: Training) -
         error = np.sqrt(np.maximum(np.diag(stage.covariance), 1e-300))
         if np.max(change / error) < training.tolerance and gained < GAIN:
             break
-    return Reached(stage, samples, equations, count)
+
+    def freedom(sigma: ndarray, signs: Sequence[ndarray]) -> ndarray:
+        trio = zip(curves, equations, signs, strict=True)
+        return np.asarray(np.sum([step.freedom(curve, sigma, probe) for curve, step, probe in trio], axis=0))
+
+    return Reached(stage, samples, freedom, count)
 
 
 def _objective(
