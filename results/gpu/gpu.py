@@ -7,7 +7,7 @@ noise. The argument is the name of the device in torch. The fits of the processo
 same time as those of the device, which has a thread of its own; a machine of 14 cores or more has one for each.
 
 A processor takes its members one after the other, so that a fit is left out that would end more than LATEST seconds
-after the start by the time that fewer members took.
+after the start by the time that fewer members took. The device begins none after that.
 """
 
 from __future__ import annotations
@@ -87,12 +87,16 @@ def on_processor(number: int, method: str, began: float) -> list[list[Any]]:
     return rows
 
 
-def on_device(device: str) -> Iterator[list[Any]]:
-    """Fit everything on the device; what it does at its first use is not counted."""
+def on_device(device: str, began: float) -> Iterator[list[Any]]:
+    """Fit everything on the device until LATEST; what it does at its first use is not counted."""
     fitted(1, "pinn-gn", 8, device)
-    for number, method, members in itertools.product(range(len(CASES)), METHODS, MEMBERS):
-        yield fitted(number, method, members, device)
-        print(f"{time.strftime('%H:%M:%S')} {device}: {CASES[number][0]} {method} {members}", flush=True)
+    for method, members, number in itertools.product(METHODS, MEMBERS, range(len(CASES))):
+        if time.time() - began > LATEST:
+            row = [CASES[number][0], method, members, device, np.nan, np.nan, np.nan, "left out"]
+        else:
+            row = fitted(number, method, members, device)
+        print(f"{time.strftime('%H:%M:%S')} {row}", flush=True)
+        yield row
 
 
 def main() -> None:
@@ -103,7 +107,7 @@ def main() -> None:
     beside = Parallel(n_jobs=len(places), return_as="generator")(
         delayed(on_processor)(number, method, began) for number, method in places
     )
-    rows = list(on_device(device))
+    rows = list(on_device(device, began))
     rows += [row for some in beside for row in some]
     about = {"command": f"python results/gpu/gpu.py {device}", "device": name(device), **origin(["torch"])}
     write_text(HERE / "gpu.csv", render(pd.DataFrame(rows, columns=COLUMNS), about, "csv"))
