@@ -31,8 +31,8 @@ def test_a_script_can_be_imported(script: Callable[[str], ModuleType], path: str
 @pytest.mark.parametrize(
     "path",
     [
-        "ablation/ablation.py", "cross/cross.py", "default/kernels.py", "efficiency/efficiency.py", "limits/which.py",
-        "paper/claims.py",
+        "ablation/ablation.py", "cross/cross.py", "default/kernels.py", "efficiency/efficiency.py", "gpu/gpu.py",
+        "limits/which.py", "paper/claims.py",
     ],
 )  # fmt: skip
 def test_a_page_is_what_its_script_makes_of_the_tables_beside_it(
@@ -67,6 +67,22 @@ def test_the_headline_is_what_the_paired_tests_say(script: Callable[[str], Modul
         f"`pinn-gn` takes {slower.min():.2g} to {slower.max():.2g} times as long as `trajectory`",
     ):
         assert told in text
+
+
+def test_what_a_gpu_saves_is_what_its_table_says(script: Callable[[str], ModuleType]) -> None:
+    gpu = script("gpu/gpu.py")
+    table = (
+        gpu.beside(pd.read_csv(RESULTS / "gpu" / "gpu.csv", comment="#")).set_index(["method", "members"]).sort_index()
+    )
+    faster = table["times as fast"]
+    many, alone = (faster.loc["pinn-gn", members].dropna() for members in (64, 1))
+    text = words("method")
+    assert f"with 64 members takes {many.min():.0f} to {many.max():.0f} times less time" in text
+    assert f"without members {alone.min():.2g} to {alone.max():.2g} times less" in text
+    assert faster.loc["pinn", 1].max() < 1 < faster.loc["pinn", 8].min()
+    own = table.loc["pinn-gn"]
+    own = own[own["cpu e2"] != ""]
+    assert (abs(own["cpu e2"] - own["cuda e2"]) < 1e-4 * own["cuda e2"]).all()
 
 
 def words(page: str) -> str:

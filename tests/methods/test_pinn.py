@@ -13,6 +13,7 @@ from latticebench.methods.engine.inputs import inputs
 from latticebench.methods.method import make, settings, solve
 from latticebench.methods.pielm import PIELM
 from latticebench.methods.pinn import PINN
+from latticebench.methods.pinn_gn import PINNGaussNewton
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -151,7 +152,7 @@ def test_unsound_settings_are_named(name, value):
         make(PINN, {name: value})
 
 
-@pytest.mark.parametrize("kind", [PINN, PIELM])
+@pytest.mark.parametrize("kind", [PINN, PIELM, PINNGaussNewton])
 @pytest.mark.parametrize("device", ["nonesuch", "cuda"])
 def test_a_device_that_is_not_there_is_told_in_one_line(kind, device):
     torch = pytest.importorskip("torch")

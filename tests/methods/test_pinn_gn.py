@@ -9,6 +9,7 @@ import pytest
 
 from latticebench import systems
 from latticebench.bench.limit import bound_of
+from latticebench.methods.engine.networks import side_by_side
 from latticebench.methods.method import Skipped, make, solve
 from latticebench.methods.pinn_gn import PINNGaussNewton
 from latticebench.systems.errors import InputError
@@ -120,6 +121,22 @@ def test_members_tell_how_far_the_noise_may_have_moved_a_coefficient():
     spreads = np.array([fit.found[f"spread of {text}"] for text in one.texts])
     np.testing.assert_allclose(np.log(spreads / fit.stderr), 0, atol=np.log(4))
     assert fit.found["interval of u[n]"] == pytest.approx(2.571 * fit.found["spread of u[n]"], rel=1e-3)
+
+
+@pytest.mark.parametrize(("name", "candidates"), [FOUR[0], FOUR[3]])
+def test_a_device_finds_what_the_processor_finds_and_so_do_the_members(name, candidates, monkeypatch):
+    system = shaken(name)
+    one = system.library(candidates)
+    samples = [seen(system, 0.02, seed, sites=5, times=sample_times(15)) for seed in (1, 2)]
+    alone = solve(PINNGaussNewton(width=24, members=3), samples, one, system.order, 0)
+    # Two batches, of two members and of one.
+    monkeypatch.setattr(side_by_side, "_bytes", lambda *_: side_by_side.MEMORY / 2)
+    fit = solve(PINNGaussNewton(width=24, members=3, device="cpu:0"), samples, one, system.order, 0)
+    assert np.max(np.abs(fit.coefficients - alone.coefficients) / alone.stderr) < 0.01
+    np.testing.assert_allclose(fit.stderr, alone.stderr, rtol=0.01)
+    names = [f"spread of {text}" for text in one.texts]
+    spreads = [[found[name] for name in names] for found in (fit.found, alone.found)]
+    np.testing.assert_allclose(*spreads, rtol=0.05)
 
 
 @pytest.mark.parametrize(

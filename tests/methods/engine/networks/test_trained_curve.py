@@ -1,10 +1,14 @@
-"""The equations of a step against a dense least-squares problem whose derivatives are differences."""
+"""The equations of a step against a dense least-squares problem whose derivatives are differences; on a device too."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from latticebench.methods.engine.networks.arrays import Arrays, host
+from latticebench.methods.engine.networks.curve_batch import BatchWeights, batch_equations, curve_batch
 from latticebench.methods.engine.networks.hidden_layer import draw_layer
 from latticebench.methods.engine.networks.trained_curve import Weights, place_curve, step_equations
 from latticebench.methods.engine.record import prepare
@@ -64,6 +68,47 @@ def test_a_step_solves_the_linearised_least_squares_problem(name, activation):
     last = np.linalg.solve(step.schur, step.aim)
     found = np.concatenate([step.own - step.across @ last, last])
     np.testing.assert_allclose(dense @ found, dense @ expected, atol=1e-5 * np.linalg.norm(dense @ expected))
+
+
+@pytest.mark.parametrize("train", [False, True])
+@pytest.mark.parametrize("name", CASES)
+def test_members_on_a_device_take_the_steps_of_single_networks(name, train):
+    samples, terms, order = CASES[name]
+    given = library("mine", terms)
+    curve = place_curve(prepare(samples, given.terms, order), "tanh" if name == "free" else "sine", 11, decay=3.0)
+    draw, arrays = np.random.default_rng(3), Arrays("cpu:0")
+    members = [
+        Weights(draw_layer(curve.activation, 3, 0.0, draw), draw.normal(size=(7, curve.place.size)) / 3)
+        for _ in range(3)
+    ]
+    xi, values = draw.normal(size=(3, len(given.terms))), curve.value + draw.normal(size=(3, *curve.value.shape))
+    values *= curve.seen
+    sigma, weight = np.array([0.3, 0.4])[: len(curve.value)], 2.0
+    batch = curve_batch(curve, samples, given, values, arrays)
+    weights = BatchWeights(*(arrays.move(np.stack(parts)) for parts in zip(*members, strict=True)))
+    steps = batch_equations(batch, weights, arrays.move(xi), arrays.move(sigma), weight, train=train)
+    signs = draw.choice([-1.0, 1.0], size=(*curve.value.shape, 5))
+    freedom = host(steps.freedom(batch, arrays.move(sigma), arrays.move(signs)))
+    missed = [host(one) for one in batch.misfits(weights, arrays.move(xi))]
+    for member, one in enumerate(members):
+        alone = replace(curve, value=values[member])
+        step = step_equations(alone, one, xi[member], sigma, weight, train=train)
+        for found, expected in (
+            (host(steps.schur)[member], step.schur),
+            (host(steps.aim)[member], step.aim),
+            (host(steps.damped)[member], step.damped),
+            # The orthonormal functions are others, the units' weights are not.
+            (
+                host(steps.turn)[member] @ host(steps.own)[member].reshape(curve.place.size, -1).T,
+                step.turn @ step.own.reshape(curve.place.size, -1).T,
+            ),
+            (freedom[member], step.freedom(alone, sigma, signs)),
+            (
+                np.append(missed[0][member], [one[member] for one in missed[1:]]),
+                np.hstack(alone.misfits(one, xi[member])),
+            ),
+        ):
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * np.max(np.abs(expected), initial=0))
 
 
 def test_the_degrees_of_freedom_are_the_trace_of_the_hat_matrix():
