@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import tempfile
+import weakref
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -15,23 +16,30 @@ from latticebench.systems.errors import InputError
 if TYPE_CHECKING:
     from numpy import ndarray
 
-# Bytes up to which an array is kept in memory; a larger one is a temporary file, mapped.
+# Bytes of arrays that are kept in memory at a time; what is more than that is in temporary files, mapped.
 IN_MEMORY = 2**27
 # Values that are computed with at once where that is free to choose: 16 MiB of double precision.
 PIECE = 2**21
 
 
-def empty(shape: tuple[int, ...], kind: Any = float) -> ndarray:
-    """Return an array without values, in memory or, above IN_MEMORY, in a temporary file (in TMPDIR) that is mapped.
+# The arrays of `empty` that are in memory, by their number, as long as they are in use.
+_in_use: weakref.WeakValueDictionary[int, ndarray] = weakref.WeakValueDictionary()
 
-    The file has no name; it is gone with the array.
+
+def empty(shape: tuple[int, ...], kind: Any = float) -> ndarray:
+    """Return an array without values, in memory or in a temporary file (in TMPDIR) that is mapped.
+
+    It is in a file if with it the arrays of this function that are still in use took more than IN_MEMORY. The file has
+    no name; it is gone with the array.
 
     Raises:
         InputError: the disk has no room for it.
     """
     size = math.prod(shape) * np.dtype(kind).itemsize
-    if size <= IN_MEMORY:
-        return np.empty(shape, kind)
+    if size + sum(one.nbytes for one in list(_in_use.values())) <= IN_MEMORY:
+        found = np.empty(shape, kind)
+        _in_use[id(found)] = found
+        return found
     try:
         with tempfile.TemporaryFile(prefix="latticebench-") as file:
             # A mapped file for which the disk has no room ends the process when it is written to.

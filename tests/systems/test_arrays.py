@@ -44,6 +44,17 @@ def test_a_large_array_is_a_mapped_file_without_a_name_and_a_small_one_is_none(s
     assert os.listdir(tmp_path) == []
 
 
+def test_arrays_in_use_share_the_memory_and_give_it_back(monkeypatch):
+    monkeypatch.setattr(arrays, "IN_MEMORY", 1000 + sum(one.nbytes for one in arrays._in_use.values()))
+    first = empty((100,))
+    assert isinstance(empty((30,)), np.memmap)
+    view = first[2:]
+    del first
+    assert isinstance(empty((30,)), np.memmap)
+    del view
+    assert not isinstance(empty((100,)), np.memmap)
+
+
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="the system reserves no room")
 def test_a_disk_without_room_for_an_array_is_told(small_memory, monkeypatch):
     def full(*_):
