@@ -12,7 +12,7 @@ from latticebench.bench.escape import label
 from latticebench.bench.inspection import Inspection
 from latticebench.bench.plots import in_decades
 from latticebench.bench.report.rows import Table
-from latticebench.bench.report.units import axis, with_unit
+from latticebench.bench.report.units import axis, rate_of, with_unit
 from latticebench.diagnosis.problem import Spectrum
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.systems.samples import Samples
@@ -42,11 +42,12 @@ def lines(found: Inspection, time: str) -> list[str]:
     seen = f", with {' and '.join(FIELDS[one] for one in found.seen)}" if found.seen else ""
     span = f"t = {found.begin:g} to {found.end:g} {time}".rstrip()
     every = f"every {found.interval:.4g} {time}".rstrip() + (", unevenly" if found.uneven else "")
-    frequencies = ", ".join(f"{one:.4g}" for one in found.frequencies)
+    cycles, angular = (", ".join(f"{by * one:.4g}" for one in found.frequencies) for by in (1, 2 * np.pi))
+    told = f"{with_unit(angular, rate_of('rad', time))} ({cycles} cycles per {time or 'unit of time'})"
     return [
         f"{extent(found.sites, found.rows)}{seen}; {span}, {every}",
         *(f"gap from t = {begin:g} to {end:g}" for begin, end in found.gaps),
-        f"main frequencies in cycles per {time or 'unit of time'}: {frequencies or 'none stands out'}",
+        f"main angular frequencies: {told if cycles else 'none stands out'}",
     ]
 
 
@@ -97,10 +98,10 @@ def picture(samples: Samples, figure: Figure | None = None) -> Figure:
     apart = label(with_unit(f"{spacing:.2g}", origin.unit))
     readings.set_title(f"readings about their means; {apart} from one to the next")
     spectrum = Spectrum.of(samples)
-    powers.plot(spectrum.omega / (2 * np.pi), spectrum.power, color=INK, linewidth=0.8)
+    powers.plot(spectrum.omega, spectrum.power, color=INK, linewidth=0.8)
     if in_decades(powers):
         top = float(np.max(spectrum.power))
         powers.set_ylim(1e-8 * top, 2 * top)
-    powers.set_xlabel(f"cycles per {label(origin.time) or 'unit of time'}")
+    powers.set_xlabel(axis("angular frequency", rate_of("rad", origin.time)))
     powers.set_title("mean power spectrum")
     return figure

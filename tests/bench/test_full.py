@@ -101,7 +101,7 @@ def test_an_output_on_a_disk_that_is_full_at_many_points_is_whole_or_not_there(n
             "r.html",
             "u'' =",
         ),
-        (["inspect", "t.csv", "--json", "r.json", "--out", "r.svg"], "r.svg", "main frequencies"),
+        (["inspect", "t.csv", "--json", "r.json", "--out", "r.svg"], "r.svg", "main angular frequencies"),
     ],
 )
 def test_where_one_place_fails_the_other_output_is_written_and_the_screen_has_it(
