@@ -125,13 +125,15 @@ def test_members_tell_how_far_the_noise_may_have_moved_a_coefficient():
 
 @pytest.mark.parametrize(("name", "candidates"), [FOUR[0], FOUR[3]])
 def test_a_device_finds_what_the_processor_finds_and_so_do_the_members(name, candidates, monkeypatch):
+    torch = pytest.importorskip("torch")
+    device = "cuda" if torch.cuda.is_available() else "cpu:0"
     system = shaken(name)
     one = system.library(candidates)
-    samples = [seen(system, 0.02, seed, sites=5, times=sample_times(15)) for seed in (1, 2)]
-    alone = solve(PINNGaussNewton(width=24, members=3), samples, one, system.order, 0)
+    samples = [seen(system, 0.02, seed, sites=5, times=sample_times(12)) for seed in (1, 2)]
+    alone = solve(PINNGaussNewton(width=16, members=3), samples, one, system.order, 0)
     # Two batches, of two members and of one.
     monkeypatch.setattr(side_by_side, "_bytes", lambda *_: side_by_side.MEMORY / 2)
-    fit = solve(PINNGaussNewton(width=24, members=3, device="cpu:0"), samples, one, system.order, 0)
+    fit = solve(PINNGaussNewton(width=16, members=3, device=device), samples, one, system.order, 0)
     assert np.max(np.abs(fit.coefficients - alone.coefficients) / alone.stderr) < 0.01
     np.testing.assert_allclose(fit.stderr, alone.stderr, rtol=0.01)
     names = [f"spread of {text}" for text in one.texts]

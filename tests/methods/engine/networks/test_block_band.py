@@ -13,6 +13,7 @@ MEMBERS, R = 3, 2
 
 @pytest.mark.parametrize(("outputs", "diagonals"), [(1, 1), (4, 1), (5, 2), (7, 3), (6, 5)])
 def test_dividing_solves_each_member_and_an_indefinite_matrix_is_told(outputs, diagonals):
+    pytest.importorskip("torch")
     draw, arrays = np.random.default_rng(outputs), Arrays("cpu:0")
     size = outputs * R
     place = np.arange(size) // R

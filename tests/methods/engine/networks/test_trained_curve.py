@@ -73,6 +73,7 @@ def test_a_step_solves_the_linearised_least_squares_problem(name, activation):
 @pytest.mark.parametrize("train", [False, True])
 @pytest.mark.parametrize("name", CASES)
 def test_members_on_a_device_take_the_steps_of_single_networks(name, train):
+    pytest.importorskip("torch")
     samples, terms, order = CASES[name]
     given = library("mine", terms)
     curve = place_curve(prepare(samples, given.terms, order), "tanh" if name == "free" else "sine", 11, decay=3.0)
