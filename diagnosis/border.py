@@ -32,8 +32,9 @@ MOST = 0.6
 # Numbers of B-splines that are compared first, and how often the way to the nearest ones is halved.
 SIZES, HALVED = 8, 2
 # So many times as many are taken as cross-validation asks for: there errors of the curve and of its numbers are of one
-# size, but errors of the curve look like forces; they fall with the sixth power.
-FINER = 1.25
+# size, but errors of the curve look like forces on its neighbours, whose readings tell more of it than its own do. They
+# fall with the sixth power.
+FINER = 1.5
 # Innovations of stronger correlations would say nothing of the slow part of a motion.
 MOST_CORRELATED = 0.98
 # Knots reach beyond the rows of a piece by this share of the time between rows.

@@ -200,11 +200,13 @@ class Fitted:
         layout: the pieces.
         followed: the model along them.
         noise: of every sensor.
-        cost: minus the logarithm of the likelihood, in nats.
+        cost: minus the logarithm of the likelihood, in nats, times the share of the readings that the curves of the
+            sites without an equation leave free: where they follow the noise there is none to compare models by.
         covariance: of the model's numbers, with what the model misfits.
         dispersion: by how much likelihood ratios are too large, as what is left is no noise; see `Normal.dispersion`.
         converged: whether the steps came to an end.
         rows: times and sensors of the readings.
+        curved: numbers of the curves of the sites without an equation, of each sensor.
     """
 
     layout: Layout
@@ -215,6 +217,7 @@ class Fitted:
     dispersion: float
     converged: bool
     rows: Rows
+    curved: Float[ndarray, " sensors"]
 
     @property
     def model(self) -> Model:
@@ -341,17 +344,23 @@ def fit(
     if followed is None:
         return None
     rows = replace(layout.laid_out(), walking=model.walking)
-    free = _taken(followed, layout, rows)
-    noise, cost = _likely(followed, rows, free, structure, noise)
+    free, curved = _taken(followed, layout, rows)
+    share = 1 - float(np.sum(curved)) / max(layout.readings(), 1)
+    noise, cost = _likely(followed, rows, free, share, structure, noise)
+    if np.any(curved):
+        free, curved = _leverage(followed, layout, noise, rows, curved)
+        noise, cost = _likely(followed, rows, free, share, structure, noise)
     damping, converged = DAMPING, False
     for step in range(steps):
         least = (cost - hope) / 2 if step >= BLIND else 0.0
-        found = _stepped(layout, followed, noise, rows, damping, least)
+        found = _stepped(layout, followed, noise, rows, damping, least / share)
         if found is None:
             converged = True
             break
         followed, damping, won = found
-        noise, cost = _likely(followed, rows, free, structure, noise)
+        if np.any(curved):
+            free, curved = _leverage(followed, layout, noise, rows, curved)
+        noise, cost = _likely(followed, rows, free, share, structure, noise)
         if won < ENOUGH:
             converged = True
             break
@@ -364,7 +373,7 @@ def fit(
     if not np.all(np.isfinite(covariance)):
         return None
     path = replace(followed.path, model=followed.model.with_walks(noise.walk))
-    return Fitted(layout, path, noise, cost, covariance, dispersion, converged, rows)
+    return Fitted(layout, path, noise, cost, covariance, dispersion, converged, rows, curved)
 
 
 def spread(error: ndarray, robust: ndarray, tail: float) -> float:
@@ -405,21 +414,47 @@ def gain(
     return np.asarray(count / 2 * (cost(before) - cost(np.maximum(after, MOST_TAKEN * before))))
 
 
-def _taken(followed: Followed, layout: Layout, rows: Rows) -> Float[ndarray, " sensors"]:
-    """Return how many numbers a fit took from the readings of each sensor."""
+def _taken(followed: Followed, layout: Layout, rows: Rows) -> tuple[ndarray, Float[ndarray, " sensors"]]:
+    """Return how many numbers a fit took from the readings of each sensor, and how many of them are of its curve."""
     sensors = int(np.max(rows.sensor)) + 1
     outer = np.isin(np.arange(sensors) % layout.chain.sites, layout.plain.border)
     inner = len(followed.model.numbers) + layout.pieces * followed.size
     curves = layout.pieces * (followed.local - followed.size)
-    return np.where(outer, curves / max(int(np.sum(outer)), 1), inner / max(int(np.sum(~outer)), 1))
+    curved = np.where(outer, curves / max(int(np.sum(outer)), 1), 0.0)
+    return np.where(outer, curved, inner / max(int(np.sum(~outer)), 1)), curved
+
+
+def _leverage(
+    followed: Followed, layout: Layout, noise: Noise, rows: Rows, curved: Float[ndarray, " sensors"]
+) -> tuple[Float[ndarray, " sensors"], Float[ndarray, " sensors"]]:
+    """Return what `_taken` does, by how far each sensor's readings draw the fit to themselves.
+
+    That is the trace of the hat matrix over the readings of a sensor. Where curves are fitted, the readings of their
+    neighbours tell as much of them as their own do.
+    """
+    _, error, slope, _ = whitened(followed, noise, rows)
+    size = followed.local
+    solved = normal(layout, error, slope, size, 0.0)
+    scale = 1 / np.sqrt(np.maximum(np.diag(solved.matrix), 1e-200))
+    inverse = np.linalg.pinv(solved.matrix * scale * scale[:, None], rcond=UNDETERMINED, hermitian=True)
+    pulls = []
+    for by, inner in zip(solved.slope, solved.inner, strict=True):
+        unit, divided = scaled_inverse(np.swapaxes(by[:, :, :size], 1, 2) @ by[:, :, :size], 0.0)
+        local = by[:, :, :size] / unit[:, None]
+        rest = (by[:, :, size:] - by[:, :, :size] @ inner[:, :, :-1]) * scale
+        pulls.append((np.sum((local @ divided) * local, axis=2) + np.sum((rest @ inverse) * rest, axis=2)).ravel())
+    channels = np.broadcast_to(rows.sensor, (len(error), len(rows.sensor)))
+    sensor = np.concatenate([one.ravel() for one in by_pieces(layout, channels)])
+    free = np.bincount(sensor, np.concatenate(pulls), minlength=len(curved))
+    return free, free * (np.sum(curved) / max(float(np.sum(free)), 1e-300))
 
 
 def _likely(
-    followed: Path, rows: Rows, free: ndarray, structure: Structure | None, start: Noise | None
+    followed: Path, rows: Rows, free: ndarray, share: float, structure: Structure | None, start: Noise | None
 ) -> tuple[Noise, float]:
-    """Return the noise that makes what is left most likely, and the cost."""
+    """Return the noise that makes what is left most likely, and the cost; see `Fitted.cost` for the share."""
     noise = estimate(followed.left, followed.swing, rows, free=free, structure=structure, start=start)
-    return noise, -noise.log_likelihood(followed.left, followed.swing, rows)
+    return noise, -share * noise.log_likelihood(followed.left, followed.swing, rows)
 
 
 def _stepped(

@@ -206,8 +206,9 @@ def _tell_estimate(suite: Suite, part: Shard, jobs: int, folder: Path, retry: bo
     to_run = found.cases - found.there
     print(f"{found.cases} cases, {found.there} of them finished in {shown(folder)}; {to_run} to run")
     if found.known:
+        most = "about" if found.known == to_run else "at least"
         print(
-            f"about {clock(found.seconds(jobs))} on {jobs} worker{'s' if jobs > 1 else ''}, {found.core_hours:.2g} "
+            f"{most} {clock(found.seconds(jobs))} on {jobs} worker{'s' if jobs > 1 else ''}, {found.core_hours:.2g} "
             f"core-hours, by what {found.known} of the {to_run} took in {' and '.join(map(shown, found.sources))}"
         )
     if found.known < to_run:

@@ -27,12 +27,13 @@ def rate(_, y):
     return np.concatenate([v, 2.0 * (beside - 2 * u) - 1.5 * u])
 
 
-def problem(seed, noise=NOISE):
-    """Return a chain between walls of which nobody says so."""
+def problem(seed, noise=NOISE, every=1):
+    """Return a chain between walls of which nobody says so, read at every so many of the times."""
     draw = np.random.default_rng(seed)
     start = draw.normal(size=2 * SITES)
     u = solve_ivp(rate, (0, T[-1]), start, t_eval=T, rtol=1e-10, atol=1e-12).y[:SITES].T
-    samples = Samples(T, u + noise * draw.normal(size=u.shape), ends="unknown")
+    read = (u + noise * draw.normal(size=u.shape))[::every]
+    samples = Samples(T[::every], read, ends="unknown")
     return Problem.of(DECLARED, 2, [samples], ())
 
 
@@ -67,6 +68,20 @@ def test_without_noise_the_curves_of_the_border_do_no_harm():
     model, layout, near = laid_out(one, 301)
     found = fit(replace(model, coefficients=(1.9, -1.4)), layout, near, structure=Structure())
     np.testing.assert_allclose(found.model.coefficients, TRUTH, rtol=3e-3)
+
+
+def test_the_noise_of_each_sensor_is_found_where_curves_take_many_numbers():
+    found = []
+    for seed in range(8):
+        model, layout, near = laid_out(problem(200 + seed, every=3), 101)
+        one = fit(model, layout, near, structure=Structure(own_sizes=True))
+        taken = np.sum(one.curved) / layout.readings()
+        found.append(one.noise.size / NOISE)
+        # All that the outer sites' curves have, and more than a tenth of what was read.
+        assert np.sum(one.curved) == pytest.approx(layout.borders[0].size * layout.pieces)
+        assert taken > 0.1
+    # Of one sensor over all seeds, within three standard errors.
+    np.testing.assert_allclose(np.mean(found, axis=0), 1, atol=3 / np.sqrt(2 * 8 * 101 * 0.7))
 
 
 @pytest.mark.slow

@@ -124,6 +124,26 @@ def test_ends_that_are_declared_wrongly_are_named_alone_where_a_kink_stands_betw
     assert found.forecast[1] < found.forecast[0]
 
 
+@pytest.mark.parametrize(
+    ("name", "sites", "count", "seed", "silent"),
+    [
+        ("phi4", 9, 101, 2, None), ("phi4", 9, 101, 1, 4), ("ginzburg-landau", 5, 155, 5, None),
+        *(slow("phi4", 9, 101, seed, 4) for seed in (2, 3)),
+        *(slow(name, 5, 155, seed, None) for name in ("dnls", "ginzburg-landau") for seed in (1, 3)),
+    ],
+)  # fmt: skip
+def test_where_the_ends_are_unknown_and_no_velocities_were_read_nothing_is_made_up(name, sites, count, seed, silent):
+    system = find(name)
+    clean = simulate(system, sites=sites, times=0.2 * np.arange(count))
+    read = observe(clean, np.random.default_rng(seed), noise=0.01).observed()
+    u = read.u.copy()
+    if silent is not None:
+        u[:, silent] = np.nan
+    data = [replace(read, u=u, v=None, ends="unknown")]
+    found = diagnose(system.library("equation"), system.order, data, CATALOGUE)
+    assert (found.verdict, found.findings, found.left) == ("nothing missing", (), ())
+
+
 @pytest.mark.parametrize("lab", [NONE, slow(SPIKES)], ids=str)
 def test_where_nothing_is_missing_nothing_is_named(lab):
     found = diagnosed(lab)
