@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 # Chains shorter than this are drawn as lines: a map would have too few rows.
 MAPPED = 4
-# Sites with a line or a portrait of their own, and the samples that a line of readings with a fit has at most.
-MOST_SITES, MOST_SAMPLES = 8, 240
+# Sites with a line or a portrait of their own, and the samples that a line of readings with a fit has at most: a few
+# periods, so that a curve is seen beside readings that it misses.
+MOST_SITES, MOST_SAMPLES = 8, 100
 WIDTH, HEIGHT = 5.6, 3.6
 # Coefficients with a name beside their learning curves, and steps so few that each has a dot.
 MOST_TERMS, FEW_STEPS = 8, 40

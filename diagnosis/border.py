@@ -32,9 +32,11 @@ MOST = 0.6
 # Numbers of B-splines that are compared first, and how often the way to the nearest ones is halved.
 SIZES, HALVED = 8, 2
 # So many times as many are taken as cross-validation asks for: there errors of the curve and of its numbers are of one
-# size, but errors of the curve look like forces on its neighbours, whose readings tell more of it than its own do. They
-# fall with the sixth power.
-FINER = 1.5
+# size, but errors of the curve look like forces. They fall with the sixth power.
+FINER = 1.25
+# And how many times as many as that may be taken, where the neighbours' readings tell of a motion that hardly shows in
+# those of the outer sites.
+FINENESS = (1.0, 1.5, 2.25)
 # Innovations of stronger correlations would say nothing of the slow part of a motion.
 MOST_CORRELATED = 0.98
 # Knots reach beyond the rows of a piece by this share of the time between rows.
@@ -121,6 +123,7 @@ def borders(
     rows: Sequence[Int[ndarray, "pieces m"]],
     valid: Sequence[Bool[ndarray, "pieces m"]],
     memory: float = 0.0,
+    fineness: float = 1.0,
 ) -> tuple[Border | None, ...]:
     """Return the curves of each recording's outer sites, with as many B-splines as cross-validation asks for.
 
@@ -131,6 +134,7 @@ def borders(
         rows: of each piece.
         valid: whether a row is none of those repeated at the end of a shorter piece.
         memory: correlation time of the noise; 0 for white noise.
+        fineness: so many times as many B-splines are taken; of `FINENESS`.
     """
     if not len(plain.border):
         return (None,) * len(records)
@@ -152,7 +156,7 @@ def borders(
         beside += [min((one for one in sizes if one > chosen), default=chosen)]
         sizes |= {round(float(np.sqrt(chosen * one))) for one in beside}
         chosen = min(sorted(sizes), key=score)
-    chosen = min(math.ceil(FINER * chosen), most - degree)
+    chosen = min(math.ceil(FINER * fineness * chosen), most - degree)
     found = []
     for number, (record, row) in enumerate(zip(records, rows, strict=True)):
         t = record.times[row]

@@ -18,7 +18,7 @@ from latticebench.diagnosis.acting import Chain
 from latticebench.diagnosis.horizon import Followed, Layout, Path, fields, follow, linearised
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Noise, Rows, Structure, Whitener
-from latticebench.diagnosis.noise_estimate import estimate
+from latticebench.diagnosis.noise_estimate import SPARE, estimate
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -225,6 +225,12 @@ class Fitted:
         return self.followed.model
 
     @property
+    def information(self) -> float:
+        """Half of Akaike's criterion, in nats, by which fits are compared whose curves have other numbers."""
+        taken = float(np.sum(self.curved))
+        return self.cost / left_free(1.0, taken / max(self.layout.readings(), 1)) + taken
+
+    @property
     def least(self) -> Float[ndarray, " sensors"]:
         """The smallest variance that the noise of each sensor may have, in units of the one that was found."""
         return np.asarray((self.rows.least / self.noise.size) ** 2)
@@ -345,7 +351,7 @@ def fit(
         return None
     rows = replace(layout.laid_out(), walking=model.walking)
     free, curved = _taken(followed, layout, rows)
-    share = 1 - float(np.sum(curved)) / max(layout.readings(), 1)
+    share = left_free(1.0, curved / max(layout.readings(), 1))
     noise, cost = _likely(followed, rows, free, share, structure, noise)
     if np.any(curved):
         free, curved = _leverage(followed, layout, noise, rows, curved)
@@ -414,6 +420,11 @@ def gain(
     return np.asarray(count / 2 * (cost(before) - cost(np.maximum(after, MOST_TAKEN * before))))
 
 
+def left_free(count: float, taken: Float[ndarray, " sensors"] | float) -> float:
+    """Return how many of so many readings a fit leaves free that takes some of them, at least SPARE of all."""
+    return max(count - float(np.sum(taken)), SPARE * count)
+
+
 def _taken(followed: Followed, layout: Layout, rows: Rows) -> tuple[ndarray, Float[ndarray, " sensors"]]:
     """Return how many numbers a fit took from the readings of each sensor, and how many of them are of its curve."""
     sensors = int(np.max(rows.sensor)) + 1
@@ -427,14 +438,12 @@ def _taken(followed: Followed, layout: Layout, rows: Rows) -> tuple[ndarray, Flo
 def _leverage(
     followed: Followed, layout: Layout, noise: Noise, rows: Rows, curved: Float[ndarray, " sensors"]
 ) -> tuple[Float[ndarray, " sensors"], Float[ndarray, " sensors"]]:
-    """Return what `_taken` does, by how far each sensor's readings draw the fit to themselves.
+    """Return what `_taken` does, by how far readings draw the fit to themselves: traces of the hat matrix.
 
-    That is the trace of the hat matrix over the readings of a sensor. Where curves are fitted, the readings of their
-    neighbours tell as much of them as their own do.
+    Where curves are fitted, the readings of their neighbours tell as much of them as their own do.
     """
     _, error, slope, _ = whitened(followed, noise, rows)
-    size = followed.local
-    solved = normal(layout, error, slope, size, 0.0)
+    solved, size = normal(layout, error, slope, followed.local, 0.0), followed.local
     scale = 1 / np.sqrt(np.maximum(np.diag(solved.matrix), 1e-200))
     inverse = np.linalg.pinv(solved.matrix * scale * scale[:, None], rcond=UNDETERMINED, hermitian=True)
     pulls = []

@@ -98,7 +98,9 @@ class Layout:
             found_rows.append(np.stack([np.minimum(begin + np.arange(m), end - 1) for begin, end in pieces]))
             found_valid.append(np.stack([begin + np.arange(m) < end for begin, end in pieces]))
         substeps = tuple(np.ones(rows.shape[0] * (rows.shape[1] - 1), dtype=int) for rows in found_rows)
-        curves = borders(problem.records, problem.plain, problem.splines, found_rows, found_valid, memory)
+        curves = borders(
+            problem.records, problem.plain, problem.splines, found_rows, found_valid, memory, problem.fineness
+        )
         return cls(
             problem.chain, problem.plain, problem.records, problem.splines, curves, tuple(found_rows),
             tuple(found_valid), substeps, small,

@@ -1,10 +1,12 @@
-"""How a measured input goes on between its samples: as the readings say."""
+"""How inputs go on between their samples, measured ones and the motion of outer sites: as the readings say."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from latticebench.diagnosis import rules
+from latticebench.diagnosis.border import FINENESS
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.problem import DEGREES, Problem
 
@@ -19,13 +21,17 @@ WORDS = {
 def interpolations(problem: Problem, *, early: bool) -> list[Problem]:
     """Return the problem with its present interpolation of inputs, then with others.
 
-    These are all there are while it is `early`, later those next to the present one; none without an input.
+    These are all there are while it is `early`, later those next to the present one; none without an input. Where the
+    ends are unknown, curves of the outer sites follow that are finer, or less fine.
     """
-    if not _has_input(problem):
-        return [problem]
-    here = DEGREES.index(problem.degree)
-    others = DEGREES if early else DEGREES[max(here - 1, 0) : here + 2]
-    return [problem, *(problem.interpolated(degree) for degree in others if degree != problem.degree)]
+    found = [problem]
+    if _has_input(problem):
+        here = DEGREES.index(problem.degree)
+        others = DEGREES if early else DEGREES[max(here - 1, 0) : here + 2]
+        found += [problem.interpolated(degree) for degree in others if degree != problem.degree]
+    if len(problem.plain.border):
+        found += [replace(problem, fineness=one) for one in FINENESS if one != problem.fineness]
+    return found
 
 
 def likeliest(
@@ -33,11 +39,11 @@ def likeliest(
 ) -> tuple[Problem, Fitted | None]:
     """Return the problem under which a model is most likely, and its fit; the first if none is plainly better."""
     best, fitted = problems[0], fitting(problems[0])
-    least = float("inf") if fitted is None else fitted.cost - rules.EQUAL * fitted.dispersion
+    least = float("inf") if fitted is None else fitted.information - rules.EQUAL * fitted.dispersion
     for other in problems[1:]:
         found = fitting(other)
-        if found is not None and found.cost < least:
-            best, fitted, least = other, found, found.cost
+        if found is not None and found.information < least:
+            best, fitted, least = other, found, found.information
     return best, fitted
 
 

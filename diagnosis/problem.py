@@ -139,6 +139,7 @@ class Problem:
         step: typical time between readings.
         forced: the inputs of each recording at their own times; None where nothing was measured.
         degree: of the splines between them, of `DEGREES`.
+        fineness: of the curves of the sites without an equation, of `latticebench.diagnosis.border.FINENESS`.
         scene: where effects are placed.
         candidates: all effects in all places.
         unrounded: where the mean error of rounded readings has been taken away, the smallest noise with it; else 0.
@@ -158,6 +159,7 @@ class Problem:
     candidates: tuple[Placed, ...]
     forced: tuple[Samples | None, ...] = ()
     degree: int = 3
+    fineness: float = 1.0
     unrounded: float = 0.0
 
     @classmethod

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.acting import Placed
-from latticebench.diagnosis.fitting import Fitted, by_pieces, gain, normal, scaled_inverse, whitened
+from latticebench.diagnosis.fitting import Fitted, by_pieces, gain, left_free, normal, scaled_inverse, whitened
 from latticebench.diagnosis.horizon import fields
 from latticebench.diagnosis.model import Assembled, Model, read_term
-from latticebench.diagnosis.noise_estimate import SPARE
 from latticebench.diagnosis.propagation import propagate
 
 if TYPE_CHECKING:
@@ -295,17 +294,15 @@ class Tangent:
         gains = np.zeros(does.shape[1])
         for number in range(int(np.max(sensor)) + 1):
             here = sensor == number
-            count, total = float(np.sum(self._read[here])), float(np.sum(self.left[here] ** 2))
-            count = max(
-                count - float(np.sum(self.fitted.curved if alike else self.fitted.curved[number])), SPARE * count
-            )
+            total, taken = float(np.sum(self.left[here] ** 2)), self.fitted.curved
+            count = left_free(float(np.sum(self._read[here])), taken if alike else taken[number])
             after = np.sum((self.left[here, None] - does[here]) ** 2, axis=0)
             gains += gain(total, after, count, self.fitted.least[number]) if count else 0.0
         return [float(one) for one in gains]
 
     def gain(self, won: Float[ndarray, " candidates"]) -> Float[ndarray, " candidates"]:
         """Return the nats that so much of the sum of squares is worth, the size of the noise being free."""
-        total, count = float(np.sum(self.error**2)), float(np.sum(self._read)) - float(np.sum(self.fitted.curved))
+        total, count = float(np.sum(self.error**2)), left_free(float(np.sum(self._read)), self.fitted.curved)
         return gain(total, total - won, count, float(np.min(self.fitted.least)))
 
     def _columns(self, number: int, batch: Sequence[Placed]) -> ndarray:

@@ -13,15 +13,16 @@ after the start by the time that fewer members took. The device begins none afte
 from __future__ import annotations
 
 import itertools
+import multiprocessing
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
 
 from latticebench import methods
 from latticebench.bench.case import Folders
@@ -104,11 +105,10 @@ def main() -> None:
     device = sys.argv[1] if len(sys.argv) > 1 else "cuda"
     began = time.time()
     places = list(itertools.product(range(len(CASES)), METHODS))
-    beside = Parallel(n_jobs=len(places), return_as="generator")(
-        delayed(on_processor)(number, method, began) for number, method in places
-    )
-    rows = list(on_device(device, began))
-    rows += [row for some in beside for row in some]
+    with ProcessPoolExecutor(len(places), multiprocessing.get_context("spawn")) as pool:
+        beside = [pool.submit(on_processor, number, method, began) for number, method in places]
+        rows = list(on_device(device, began))
+        rows += [row for some in beside for row in some.result()]
     about = {"command": f"python results/gpu/gpu.py {device}", "device": name(device), **origin(["torch"])}
     write_text(HERE / "gpu.csv", render(pd.DataFrame(rows, columns=COLUMNS), about, "csv"))
     write_text(HERE / "gpu.md", page())
