@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.noise import Noise
+from latticebench.methods.engine.record import without_halves
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Shaped
@@ -68,7 +69,7 @@ def without(samples: Samples, sites: Sequence[int]) -> Samples:
     """Return a recording without the readings of the sensors at some sites."""
     kept = ~np.isin(np.arange(samples.sites), sites)
     u, v = (None if field is None else np.where(kept, field, np.nan) for field in (samples.u, samples.v))
-    return samples if np.all(kept) or u is None else replace(samples, u=u, v=v)
+    return samples if np.all(kept) or u is None else without_halves(replace(samples, u=u, v=v))
 
 
 def _first(field: Shaped[ndarray, "time sites"]) -> Shaped[ndarray, " sites"]:

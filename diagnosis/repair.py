@@ -24,6 +24,7 @@ from latticebench.diagnosis.progress import Found, Horizon
 from latticebench.diagnosis.search import Search, Watcher
 from latticebench.diagnosis.unnamed import Left, without_name
 from latticebench.diagnosis.worth import lost
+from latticebench.methods.engine.record import without_halves
 from latticebench.methods.method import check_fit
 from latticebench.systems.arrays import free_memory
 from latticebench.systems.effects import Effect
@@ -159,13 +160,13 @@ def diagnose(
         InputError: the equation cannot be set up on the data.
         Interrupted: the user stopped it (KeyboardInterrupt) when something was known already.
     """
-    shown = [one.observed() if isinstance(one, SimulatedSamples) else one for one in data]
+    shown = [without_halves(one.observed() if isinstance(one, SimulatedSamples) else one) for one in data]
     check_fit(shown, declared, order)
     _check_motion(shown)
     # More threads than this are slower on matrices of these sizes.
     with threadpool_limits(1):
         problem, dead = _problem(declared, order, shown, catalogue)
-        held_out = [without(one, dead) for one in held_out]
+        held_out = [without_halves(without(one, dead)) for one in held_out]
         search = Search(problem, functools.partial(_say, data[0].source, watcher))
         found = None
 

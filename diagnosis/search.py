@@ -19,7 +19,7 @@ from latticebench.diagnosis.border import MOST
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.glance import crowding, most_promising
 from latticebench.diagnosis.horizon import Layout, unread
-from latticebench.diagnosis.inputs import interpolations, likeliest
+from latticebench.diagnosis.inputs import finest, interpolations, likeliest
 from latticebench.diagnosis.mirrored import images, mirrored
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
@@ -208,8 +208,13 @@ class Search:
         """Return the declared equation and the best models on a longer horizon."""
         self.small = fine(self.problem, last.models[0])
         self._choose_structure(last.models[0])
+        laid, carry = functools.partial(self.layout, length), functools.partial(self.carry, last.models[0])
         on_inputs = interpolations(self.problem, early=len(last.horizons) == 1)
-        self.problem, best = likeliest(on_inputs, lambda one: self.carry(last.models[0], self.layout(length, one)))
+        border = len(self.problem.plain.border) > 0
+        if len(on_inputs) > 1 or not border:
+            self.problem, best = likeliest(on_inputs, lambda one: carry(laid(one)))
+        if border:
+            self.problem, best = finest(self.problem, laid, carry)
         layout = self.layout(length) if best is None else best.layout
         more = (self.carry(one, layout) for one in last.models[1:])
         fits = [found for found in (best, *more) if found is not None]

@@ -77,7 +77,9 @@ def prepare(
     dynamics = Dynamics(terms, order, samples.is_complex, samples.sites, samples.ends, weights, factors, least_reach)
     fields = [samples.u] if order == 1 or samples.v is None else [samples.u, samples.v]
     value = np.stack([split_parts(one, samples.is_complex) for one in fields], axis=1)
-    seen = np.isfinite(value)
+    # A complex value of which one part is missing is missing.
+    known = np.isfinite(value)
+    seen = known & np.all(known, axis=2, keepdims=True)
     drive = choose_basis(samples, dynamics) if len(dynamics.border) else None
     inputs = None
     if samples.f is not None and any("f" in term.names for term in terms):

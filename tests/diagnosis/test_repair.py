@@ -144,6 +144,19 @@ def test_where_the_ends_are_unknown_and_no_velocities_were_read_nothing_is_made_
     assert (found.verdict, found.findings, found.left) == ("nothing missing", (), ())
 
 
+@pytest.mark.parametrize("lost", [np.nan, 0.3 + 0.1j, 1j * np.nan], ids=str)
+def test_a_site_of_a_complex_chain_that_was_not_read_is_no_reading_of_0(lost):
+    system = find("dnls")
+    clean = simulate(system, sites=8, times=0.1 * np.arange(143))
+    read = observe(clean, np.random.default_rng(1), noise=0.01).observed()
+    u = read.u.copy()
+    # A missing number becomes nan + 0i; a sensor that is stuck is left out.
+    u[:, 4] = lost
+    found = diagnose(system.library("equation"), 1, [replace(read, u=u, ends=system.ends)], CATALOGUE)
+    assert (found.verdict, found.findings, found.left) == ("nothing missing", (), ())
+    assert found.dead == ((4,) if np.isfinite(lost) else ())
+
+
 @pytest.mark.parametrize("lab", [NONE, slow(SPIKES)], ids=str)
 def test_where_nothing_is_missing_nothing_is_named(lab):
     found = diagnosed(lab)
