@@ -17,7 +17,7 @@ from latticebench.bench.beside import content_of
 from latticebench.bench.case import Case
 from latticebench.bench.published import folder_of
 from latticebench.bench.run import counts
-from latticebench.bench.store import Store, is_store, open_store
+from latticebench.bench.store import Store, store_in
 from latticebench.bench.suite import Suite
 from latticebench.bench.tables import read_cases
 from latticebench.systems.errors import InputError
@@ -95,7 +95,7 @@ def estimate(suite: Suite, cases: Iterable[Case], folder: Path, *, retry: bool =
         folder: where results are kept.
         retry: failed cases are run again.
     """
-    store = open_store(folder) if is_store(folder) else None
+    store = store_in(folder)
     finished = {} if store is None else _finished(store)
     wanted = {case.identity: case for case in cases}
     keys = source.keys(wanted, suite.folders)
@@ -115,7 +115,7 @@ def estimate(suite: Suite, cases: Iterable[Case], folder: Path, *, retry: bool =
 
 def seconds_of(suite: Suite, folder: Path) -> dict[str, float]:
     """Return what cases of a suite took before, by their identities, as far as it is known; see `estimate`."""
-    times, _ = _recorded(suite.name, open_store(folder) if is_store(folder) else None)
+    times, _ = _recorded(suite.name, store_in(folder))
     found = {identity: times.get(_seedless(identity)) for identity in suite.by_identity}
     return {identity: took.seconds for identity, took in found.items() if took is not None}
 

@@ -19,7 +19,7 @@ import os
 import sqlite3
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -383,6 +383,26 @@ def open_store(folder: Path) -> Store:
 def is_store(folder: Path) -> bool:
     """Return whether a folder holds a store, be it one that cannot be read."""
     return _is_file(folder / FILE) or _is_file(folder / "store.json")
+
+
+def store_in(folder: Path) -> Store | None:
+    """Return the store in a folder, to read it; None where there is none, or none yet: another run is making it.
+
+    Raises:
+        InputError: it is damaged, or of another version.
+    """
+    return open_store(folder) if is_store(folder) and not _is_blank(folder / FILE) else None
+
+
+def _is_blank(path: Path) -> bool:
+    """Return whether a file is a database that has nothing in it."""
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
+            (tables,) = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
+            (application,) = connection.execute("PRAGMA application_id").fetchone()
+    except FAILURES:
+        return False
+    return not tables and not application
 
 
 def _is_file(path: Path) -> bool:

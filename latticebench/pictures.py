@@ -117,7 +117,7 @@ class Survey(_Drawn):
         >>> survey
         Survey(arrays: 1 site, 200 rows)
         >>> [axes.get_xlabel() for axes in survey.figure.axes]
-        ['t', 'cycles per unit of time']
+        ['t', 'angular frequency']
     """
 
     samples: Samples

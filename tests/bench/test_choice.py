@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import shutil
+import sqlite3
 from collections import Counter
 from collections.abc import Collection, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -289,6 +291,19 @@ def test_hours_of_work_are_told_and_need_a_confirmation(path: str, tmp_path: Pat
     # What is finished takes no time.
     code, _, err = latticebench("run", *options, cwd=tmp_path)
     assert (code, "hours, by what" in err) == (0, False)
+
+
+@pytest.mark.parametrize("mode", ["delete", "wal"])
+def test_a_store_that_another_run_is_making_has_nothing_to_estimate_from(path: str, tmp_path: Path, mode: str) -> None:
+    (tmp_path / "store").mkdir()
+    # A database begins as an empty file; then it has its journal, and its tables and mark in one moment.
+    with closing(sqlite3.connect(tmp_path / "store" / "results.sqlite")) as connection:
+        connection.execute(f"PRAGMA journal_mode = {mode}")
+    suite = load(path)
+    found = estimate(suite, suite.cases, tmp_path / "store")
+    assert (found.there, found.known) == (0, 0)
+    create(tmp_path / "store")
+    assert estimate(suite, suite.cases, tmp_path / "store").cases == found.cases
 
 
 def test_an_estimate_counts_what_is_finished_and_takes_published_times(here: None, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import weakref
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ T, U, V = np.linspace(0, 1, 9), DRAW.normal(size=(9, 40)), DRAW.normal(size=(9, 
 def small_memory(monkeypatch):
     for module in (arrays, npz, writers):
         monkeypatch.setattr(module, "IN_MEMORY", 1000)
+    # What other tests still hold takes nothing of it.
+    monkeypatch.setattr(arrays, "_in_use", weakref.WeakValueDictionary())
 
 
 def base_of(array):
@@ -44,8 +47,7 @@ def test_a_large_array_is_a_mapped_file_without_a_name_and_a_small_one_is_none(s
     assert os.listdir(tmp_path) == []
 
 
-def test_arrays_in_use_share_the_memory_and_give_it_back(monkeypatch):
-    monkeypatch.setattr(arrays, "IN_MEMORY", 1000 + sum(one.nbytes for one in arrays._in_use.values()))
+def test_arrays_in_use_share_the_memory_and_give_it_back(small_memory):
     first = empty((100,))
     assert isinstance(empty((30,)), np.memmap)
     view = first[2:]
