@@ -17,7 +17,7 @@ import numpy as np
 from latticebench.methods.engine.networks.block_band import factor_band
 from latticebench.methods.engine.networks.equation import CurveEquation, curve_equation
 from latticebench.methods.engine.networks.hidden_layer import Layer, evaluate_layer
-from latticebench.methods.engine.networks.trained_curve import CUT, RIDGE, TrainedCurve
+from latticebench.methods.engine.networks.trained_curve import CUT, RIDGE, TrainedCurve, Weights
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples
 
@@ -25,13 +25,6 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
     from latticebench.methods.engine.networks.arrays import Array, Arrays
-
-
-class BatchWeights(NamedTuple):
-    """The weights of the members' networks: theta (members, n), and a (members, K, outputs)."""
-
-    theta: Array
-    a: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +79,7 @@ class CurveBatch:
             left.append(rate - sum(xi[:, k, None, None] * one for k, one in enumerate(values[-1])))
         return left, values, slopes
 
-    def misfits(self, weights: BatchWeights, xi: Array) -> tuple[Array, Array, Array]:
+    def misfits(self, weights: Weights, xi: Array) -> tuple[Array, Array, Array]:
         """Return `trained_curve.Misfits` of each member: (members, levels), (members,) and (members,)."""
         layer = self.layer(weights.theta)
         samples = (self.seen * self.missed(layer, weights.a) ** 2).sum((-2, -1))
@@ -159,7 +152,7 @@ class BatchEquations(NamedTuple):
 
 
 def batch_equations(
-    batch: CurveBatch, weights: BatchWeights, xi: Array, sigma: Array, weight: float, *, train: bool
+    batch: CurveBatch, weights: Weights, xi: Array, sigma: Array, weight: float, *, train: bool
 ) -> BatchEquations:
     """Set up the Gauss-Newton step of each member; see `trained_curve.step_equations`."""
     arrays, xp, points = batch.arrays, batch.arrays.xp, batch.points

@@ -15,7 +15,6 @@ import numpy as np
 from latticebench.methods.engine.networks.arrays import Arrays, host
 from latticebench.methods.engine.networks.curve_batch import (
     BatchEquations,
-    BatchWeights,
     CurveBatch,
     batch_equations,
     curve_batch,
@@ -46,7 +45,7 @@ MEMORY = 8 * 2**30
 class Point(NamedTuple):
     """Where the members are: the weights of each trajectory's networks, xi (members, J), and its covariance."""
 
-    weights: tuple[BatchWeights, ...]
+    weights: tuple[Weights, ...]
     xi: Array
     covariance: Array
 
@@ -143,7 +142,7 @@ class Device:
         def copies(array: ndarray) -> Array:
             return self.arrays.move(np.repeat(array[None], members, axis=0))
 
-        weights = tuple(BatchWeights(copies(one.theta), copies(one.a)) for one in stage.weights)
+        weights = tuple(Weights(copies(one.theta), copies(one.a)) for one in stage.weights)
         return Point(weights, copies(stage.coefficients), copies(stage.covariance))
 
 
@@ -221,7 +220,7 @@ def _stepped(arrays: Arrays, point: Point, equations: Sequence[BatchEquations], 
         step = solved[..., -1] - (solved[..., :-1] @ change[..., None])[..., 0]
         b = one.own - (one.across @ xp.concatenate([step, change], axis=-1)[..., None])[..., 0]
         theta = weights.theta + step if step.shape[-1] else weights.theta
-        moved.append(BatchWeights(theta, weights.a + one.turn @ b.reshape(weights.a.mT.shape).mT))
+        moved.append(Weights(theta, weights.a + one.turn @ b.reshape(weights.a.mT.shape).mT))
     return Point(tuple(moved), point.xi + change, covariance)
 
 
@@ -237,7 +236,7 @@ def _pseudo_inverse(arrays: Arrays, matrix: Array, least: float) -> Array:
 def _chosen(xp: Any, which: Array, new: Point, old: Point) -> Point:
     """Return the new point of some members, and the old one of the others."""
     weights = tuple(
-        BatchWeights(xp.where(which[:, None], one.theta, other.theta), xp.where(which[:, None, None], one.a, other.a))
+        Weights(xp.where(which[:, None], one.theta, other.theta), xp.where(which[:, None, None], one.a, other.a))
         for one, other in zip(new.weights, old.weights, strict=True)
     )
     covariance = xp.where(which[:, None, None], new.covariance, old.covariance)

@@ -39,7 +39,7 @@ RIDGE = 1e-14
 
 
 class Weights(NamedTuple):
-    """The weights of one network.
+    """The weights of one network, or on a device of several: with an axis of members in front.
 
     Attributes:
         theta: the hidden layer's numbers.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from latticebench.methods.engine.networks.arrays import Arrays, host
-from latticebench.methods.engine.networks.curve_batch import BatchWeights, batch_equations, curve_batch
+from latticebench.methods.engine.networks.curve_batch import batch_equations, curve_batch
 from latticebench.methods.engine.networks.hidden_layer import draw_layer
 from latticebench.methods.engine.networks.trained_curve import Weights, place_curve, step_equations
 from latticebench.methods.engine.record import prepare
@@ -86,7 +86,7 @@ def test_members_on_a_device_take_the_steps_of_single_networks(name, train):
     values *= curve.seen
     sigma, weight = np.array([0.3, 0.4])[: len(curve.value)], 2.0
     batch = curve_batch(curve, samples, given, values, arrays)
-    weights = BatchWeights(*(arrays.move(np.stack(parts)) for parts in zip(*members, strict=True)))
+    weights = Weights(*(arrays.move(np.stack(parts)) for parts in zip(*members, strict=True)))
     steps = batch_equations(batch, weights, arrays.move(xi), arrays.move(sigma), weight, train=train)
     signs = draw.choice([-1.0, 1.0], size=(*curve.value.shape, 5))
     freedom = host(steps.freedom(batch, arrays.move(sigma), arrays.move(signs)))
