@@ -57,6 +57,21 @@ def pooled(forecasts: Sequence[Prediction]) -> float:
     return float(np.sqrt(left / size)) if size > 0 else float("nan")
 
 
+def by_noise(forecasts: Sequence[Prediction], noise: Float[ndarray, " sensors"]) -> float:
+    """Return the error that forecasts would have if they were right but for the noise of the readings themselves.
+
+    Args:
+        forecasts: of the held-out data.
+        noise: standard deviation of each sensor, those of u first.
+    """
+    left, size = 0.0, 0.0
+    for one in forecasts:
+        counted = np.sum(np.isfinite(one.seen), axis=(0, 1))
+        left += float(np.nansum(counted * noise[: len(counted)] ** 2))
+        size += float(np.nansum(one.seen**2))
+    return float(np.sqrt(left / size)) if size > 0 else float("nan")
+
+
 def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) -> list[Prediction]:
     """Return forecasts.
 

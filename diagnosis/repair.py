@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from latticebench.diagnosis import modes, rules
 from latticebench.diagnosis.finding import Compared, Finding, compared, findings
 from latticebench.diagnosis.fitting import Fitted
-from latticebench.diagnosis.forecast import Prediction, pooled, predict
+from latticebench.diagnosis.forecast import Prediction, by_noise, pooled, predict
 from latticebench.diagnosis.horizon import unread
 from latticebench.diagnosis.inputs import in_words
 from latticebench.diagnosis.instrument import dead_sensors, describe, without
@@ -106,6 +106,11 @@ class Diagnosis:
     def forecast(self) -> tuple[float, float]:
         """Root mean square error of the forecasts over that of the readings, before and after."""
         return pooled(self.forecasts[0]), pooled(self.forecasts[1])
+
+    @property
+    def forecast_by_noise(self) -> float:
+        """What the noise of the held-out readings alone makes of that error."""
+        return by_noise(self.forecasts[1], self.noise)
 
     @property
     def coefficients(self) -> tuple[float, float] | None:

@@ -5,6 +5,7 @@ Residuals are in units of the noise, frequencies are angular ones (as in cos(ome
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal, cast
 
@@ -67,6 +68,7 @@ class Errors(Content):
         residual: of the fit, in units of the noise.
         rms: of the fit, in the units of the readings.
         forecast: of held-out readings, relative.
+        forecast_by_noise: what the noise of these readings alone makes of it.
         coefficients: of the declared coefficients, relative; None where the truth is not known.
         criterion: the Bayesian information criterion less that of the declared equation.
         dynamics: the share of the derivative that the equation leaves.
@@ -75,6 +77,7 @@ class Errors(Content):
     residual: Pair
     rms: Pair
     forecast: Pair
+    forecast_by_noise: Number = math.nan
     coefficients: Pair | None
     criterion: Pair
     dynamics: Pair
@@ -296,6 +299,7 @@ def _errors(diagnosis: Diagnosis, size: float) -> Errors:
     before, after = diagnosis.rms
     return Errors(
         residual=pair(diagnosis.residual), rms=pair((before / size, after / size)), forecast=pair(diagnosis.forecast),
+        forecast_by_noise=diagnosis.forecast_by_noise,
         coefficients=None if diagnosis.coefficients is None else pair(diagnosis.coefficients),
         criterion=pair(diagnosis.criterion), dynamics=pair(diagnosis.dynamics),
     )  # fmt: skip

@@ -91,6 +91,7 @@ def errors(report: Report) -> Table:
         return f"{100 * value:.3g} %" if value < DIVERGED else "diverges"
 
     error, unit = report.error, report.recording.units.reading or "the units of the readings"
+    noise = "" if math.isnan(error.forecast_by_noise) else f" (noise alone: {share(error.forecast_by_noise)})"
     rows = [
         ["residual over the noise", *(f"{one:.3g}" for one in (error.residual.before, error.residual.after))],
         [
@@ -98,12 +99,11 @@ def errors(report: Report) -> Table:
             *(f"{one:.3g}" for one in (error.rms.before, error.rms.after)),
         ],
         ["share of the derivative that is left", share(error.dynamics.before), share(error.dynamics.after)],
-        ["forecast error on held-out data", share(error.forecast.before), share(error.forecast.after)],
-        [
-            "information criterion (lower is better)",
-            *("-" if math.isnan(one) else f"{one:.1f}" for one in (error.criterion.before, error.criterion.after)),
-        ],
+        [f"forecast error on held-out data{noise}", *map(share, (error.forecast.before, error.forecast.after))],
     ]
+    if not math.isnan(error.criterion.after):
+        both = error.criterion
+        rows.append(["information criterion (lower is better)", f"{both.before:.1f}", f"{both.after:.1f}"])
     if error.coefficients is not None:
         both = error.coefficients
         rows.append(["error of the declared coefficients", share(both.before), share(both.after)])

@@ -7,10 +7,11 @@ import functools
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.special import ellipk
 
 from latticebench.diagnosis import modes
 from latticebench.diagnosis.fitting import fit
-from latticebench.diagnosis.forecast import Prediction, pooled, predict
+from latticebench.diagnosis.forecast import Prediction, by_noise, pooled, predict
 from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
@@ -58,6 +59,22 @@ def test_the_modes_of_a_linear_chain_are_those_of_its_matrix():
     assert all(np.isnan(one.decay) for one in peaks)
 
 
+def test_the_modes_of_a_nonlinear_model_are_those_of_its_swing():
+    pendulum, drag, swing = library("pendulum", "sin(u[n]); u[n]**2*v[n]"), 0.05, 1.2
+    t = np.linspace(0, 30, 600)
+    run = solve_ivp(lambda t, y: [y[1], -np.sin(y[0]) - drag * y[0] ** 2 * y[1]], t[[0, -1]], [swing, 0.0], t_eval=t,
+                    rtol=1e-10, atol=1e-11)  # fmt: skip
+    u = run.y[:1].T + 1e-4 * np.random.default_rng(1).normal(size=(600, 1))
+    problem = Problem.of(pendulum, 2, [Samples(t, u, source="pendulum", ends="free")], ())
+    layout = Layout.of(problem, 600, None, 1e-5)
+    states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
+    (mode,) = modes.of_model(fit(Model(pendulum, 2, (-1.0, -drag)), layout, states, structure=Structure()))
+    mean_square = 2 * np.mean(run.y[0] ** 2)
+    # A pendulum of amplitude A has the period 4 K(sin(A/2)); u^2 v takes the share A^2/8 of its amplitude per time.
+    assert mode.frequency == pytest.approx(np.pi / 2 / ellipk(np.sin(np.sqrt(mean_square) / 2) ** 2), rel=0.005)
+    assert mode.decay == pytest.approx(drag * mean_square / 8, rel=0.1)
+
+
 def test_the_rest_of_a_recording_is_forecast_to_the_noise():
     problem, found = fitted()
     (forecast,) = predict(found, problem)
@@ -84,6 +101,16 @@ def test_forecasts_are_pooled_by_their_squares_and_one_that_runs_away_is_infinit
     half[2:] = np.nan
     assert pooled([Prediction(t, half, seen + 0.1, 0.1)]) == pytest.approx(0.1)
     assert np.isnan(pooled([]))
+
+
+def test_a_right_forecast_is_as_wrong_as_the_noise_alone_makes_it():
+    generator, noise = np.random.default_rng(3), np.array([0.1, 0.4])
+    right = np.cos(np.linspace(0, 60, 2000))[:, None, None] * np.array([1.0, 2.0])
+    seen = right + noise * generator.normal(size=right.shape)
+    seen[generator.random(seen.shape) < 0.2] = np.nan
+    forecast = [Prediction(np.arange(2000.0), seen, right, 0.0)]
+    assert pooled(forecast) == pytest.approx(by_noise(forecast, noise), rel=0.05)
+    assert np.isnan(by_noise([], noise))
 
 
 CATALOGUE = tuple(find(name) for name in ("quadratic-drag", "defect", "sensor-offset", "constant-force"))

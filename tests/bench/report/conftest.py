@@ -151,6 +151,7 @@ def _pendula(**changes: Any) -> Any:
         "data": (Samples(t, seen, source="pendula.csv", ends="free"),), "used": (800, 800),
         "noise": size, "noise_lines": ("sensor 1: 0.03", "sensor 2: 0.02"), "residual": (15.0, 1.0),
         "rms": (0.4, 0.025), "dynamics": (0.3, 0.02), "forecasts": ([far], [near]), "forecast": (0.8, 0.01),
+        "forecast_by_noise": 0.008,
         "criterion": (0.0, -9000.0), "declared": (np.array([0.9, -8.0]), np.array([1.0, -9.0])),
         "modes": tuple([SimpleNamespace(frequency=w, decay=d) for w, d in one] for one in modes),
         "truth": np.array([1.0, -9.0]), "coefficients": (0.11, 0.0), "whole": True,

@@ -98,8 +98,10 @@ def test_a_forecast_that_runs_away_is_said_to_and_hides_no_readings(pendula: Mad
         for one in pendula().forecasts[0]
     ]
     away = pendula(forecasts=(far, pendula().forecasts[1]), forecast=(np.inf, 0.01))
-    assert ["forecast error on held-out data", "diverges", "1 %"] in rows.errors(content(away))[1]
+    assert ["forecast error on held-out data (noise alone: 0.8 %)", "diverges", "1 %"] in rows.errors(content(away))[1]
     assert to_dict(content(away))["error"]["forecast"]["before"] == "inf"
+    assert "information criterion" in page_of(away)
+    assert "information criterion" not in page_of(pendula(criterion=(0.0, np.nan)))
     assert "<svg" in page_of(away)
 
 
