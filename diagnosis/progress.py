@@ -9,7 +9,14 @@ from latticebench.diagnosis.fitting import Fitted
 
 @dataclass(frozen=True)
 class Tried:
-    """A candidate of the best model of a horizon: its score, and the nats that it had to bring."""
+    """A candidate of the best model of a horizon.
+
+    Attributes:
+        name: of the effect.
+        gain: its score, in nats.
+        price: what it has to gain: by its chance alone, beside others nearly like it that gain, too, and as a share of
+            what is left.
+    """
 
     name: str
     gain: float
@@ -25,12 +32,14 @@ class Horizon:
         periods: its length in periods of the main frequency.
         models: effects of the models that went on, and how many nats each was behind the best.
         tried: candidates of the best model, the best first.
+        misfit: whether the best model leaves so much more than noise that effects must take away a share of it.
     """
 
     samples: int
     periods: float
     models: tuple[tuple[tuple[str, ...], float], ...]
     tried: tuple[Tried, ...]
+    misfit: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from latticebench.diagnosis import rules
+from latticebench.diagnosis import lengths, rules
 from latticebench.diagnosis.acting import Placed
-from latticebench.diagnosis.border import MOST
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.glance import crowding, most_promising
 from latticebench.diagnosis.horizon import Layout, unread
@@ -48,8 +47,6 @@ FIRST, CARRIED, CHANGED = 40, 25, 10
 CLIMBING = 2
 # An effect is tried without where its own uncertainty leaves less than so many nats beyond its price.
 DOUBT = 8.0
-# Derivatives of the states of one piece by the numbers of its border, at most: they grow as the square of its length.
-MOST_MOVES = 5e6
 # A candidate may take the place of an effect if it can do this share of what the effect does.
 MOST_OF_IT = 0.9
 # A misfit grows with the signal, too: noise is taken to do so only where no more than so many times the noise is left.
@@ -86,13 +83,13 @@ class Search:
         last: Found | None = None
         stuck = opened = False
         shortest = 2 * np.pi / self.problem.fastest / self.problem.step
-        length = max(int(rules.FIRST_HORIZON * shortest), self._least)
+        length = max(int(rules.FIRST_HORIZON * shortest), lengths.least(self.problem))
         carried = self._first(length)
         if longer := self._at_once(carried):
-            carried, length = longer, self._longest
+            carried, length = longer, lengths.longest(self.problem)
         while carried:
             self.lengths.append(length)
-            whole = length >= self._longest
+            whole = length >= lengths.longest(self.problem)
             waves = length * self.problem.step * self.problem.main / (2 * np.pi)
             strays = last is not None and misfits(self.problem, last.models[0], anywhere=True)
             long = whole or waves >= rules.PERIODS
@@ -107,14 +104,15 @@ class Search:
             best = self._level(fits, before)
             base = self.value(best[0])
             models = tuple((_names(one.model), self.value(one) - base) for one in best)
-            done = (*done, Horizon(best[0].longest, waves, models, self.tried.get(best[0].model.key, ())))
+            tried, misfit = self.tried.get(best[0].model.key, ()), misfits(self.problem, best[0])
+            done = (*done, Horizon(best[0].longest, waves, models, tried, misfit))
             settled = last is not None and last.models[0].model.key == best[0].model.key
             last = Found(before, tuple(best), done, whole)
             yield last
-            further = self._further(length, settled)
+            further = lengths.longer(self.problem, length, settled)
             followed = [one for one in (before, *best) if one.longest == best[0].longest]
             if not further and (finer := without_rounding(self.problem, followed, self.value)) is not None:
-                self.problem, further = finer, [self._longest]
+                self.problem, further = finer, [lengths.longest(self.problem)]
                 self.say("taking away what rounding adds to the readings")
             each = ((self._carried(last, one), one) for one in further)
             here = [] if late else [before, *best]
@@ -129,13 +127,14 @@ class Search:
         The parts of the noise model are those that short pieces show: on long ones, what is missing looks like noise
         with a memory.
         """
-        found = self._begun(self._declared, self.problem, self.layout(self._longest), CHANGED) if first else None
+        whole = lengths.longest(self.problem)
+        found = self._begun(self._declared, self.problem, self.layout(whole), CHANGED) if first else None
         if found is None or not found.converged:
             return []
         ratio = over(self.problem, found)
         if not np.any(np.isfinite(ratio)) or np.sqrt(np.nanmean(ratio**2)) > rules.AT_ONCE:
             return []
-        return self._carried(Found(first[0], tuple(first[1:]), ()), self._longest)
+        return self._carried(Found(first[0], tuple(first[1:]), ()), whole)
 
     @functools.cached_property
     def _declared(self) -> Model:
@@ -147,33 +146,9 @@ class Search:
         near = [nodes[rows] for nodes, rows in zip(seen.nodes, layout.rows, strict=True)]
         return self.refit(model, layout.with_substeps(model, near, self.problem.top), near, None, steps)
 
-    @property
-    def _least(self) -> int:
-        """The fewest rows of a piece that say something."""
-        return 2 * self.problem.chain.order // self.problem.chain.levels + 2
-
-    @property
-    def _longest(self) -> int:
-        """The rows of the longest pieces: whole recordings, or some periods where the border has curves of its own."""
-        longest = max(len(one.t) for one in self.problem.data)
-        if not len(self.problem.plain.border):
-            return longest
-        period = 2 * np.pi / self.problem.main / self.problem.step
-        plain = self.problem.plain
-        room = int(np.sqrt(MOST_MOVES / (MOST * len(plain.border) * plain.parts * plain.size)))
-        return min(longest, max(min(round(rules.BORDER * period), room), self._least))
-
-    def _further(self, length: int, settled: bool) -> list[int]:
-        """Return the rows of the pieces of the next horizon, and shorter ones in case these cannot be followed."""
-        longest = self._longest
-        if length >= longest:
-            return []
-        further = [length * many for many in ((rules.FASTER, rules.GROWTH) if settled else (rules.GROWTH,))]
-        return list(dict.fromkeys(one if one < rules.ALMOST * longest else longest for one in further))
-
     def layout(self, length: int, problem: Problem | None = None) -> Layout:
         """Return pieces of a length: of all rows on long horizons, of some on short ones."""
-        most = None if length >= self._longest else max(ROWS, PIECES * length)
+        most = None if length >= lengths.longest(self.problem) else max(ROWS, PIECES * length)
         return Layout.of(problem or self.problem, length, most, self.small, self.memory)
 
     def _first(self, length: int) -> list[Fitted]:
@@ -484,13 +459,14 @@ class Search:
         for one in (*tangent.scored(absent), *(self.restless(fitted) if timed else ())):
             name = one.placed.effect.name
             price = self.problem.price(name, one.freedom)
-            if name not in tried or one.gain - price > tried[name].gain - tried[name].price:
-                tried[name] = Tried(name, one.gain, price)
             if one.placed.frequency is not None and one.gain > price:
                 price *= max(1.0, crowding(tangent, one.placed, self.open) / fitted.dispersion)
-            key = one.placed.place
-            least = max(price, own.price_of(one.placed) * fitted.dispersion / rules.UNDERSTATED)
-            if one.freedom and one.gain > least and (key not in best or one.gain - price > best[key][0]):
+            key, whole = one.placed.place, own.price_of(one.placed) * fitted.dispersion
+            asked = max(price, whole)
+            if name not in tried or one.gain - asked > tried[name].gain - tried[name].price:
+                tried[name] = Tried(name, one.gain, asked)
+            hopeful = one.gain > max(price, whole / rules.UNDERSTATED)
+            if one.freedom and hopeful and (key not in best or one.gain - price > best[key][0]):
                 best[key] = (one.gain - price, one)
         self.tried[fitted.model.key] = tuple(sorted(tried.values(), key=lambda one: one.price - one.gain))
         return [one for _, one in sorted(best.values(), key=lambda pair: -pair[0])]

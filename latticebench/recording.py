@@ -31,6 +31,7 @@ from latticebench.systems.stencil import Ends
 
 if TYPE_CHECKING:
     import xarray
+    from numpy import ndarray
     from numpy.typing import ArrayLike
 
 
@@ -123,9 +124,10 @@ def read(
     | pd.DataFrame
     | xarray.DataArray
     | xarray.Dataset
-    | tuple[ArrayLike, ArrayLike],
+    | tuple[ArrayLike, ArrayLike]
+    | ndarray,
     *,
-    time: str | None = None,
+    time: str | ArrayLike | None = None,
     columns: str | Sequence[str] = (),
     scale: str | float = 1.0,
     sort: bool = False,
@@ -136,8 +138,10 @@ def read(
 
     Args:
         source: a file (.csv, .txt, .tsv, .dat, .xlsx, .parquet, .npz) or several; a DataFrame; an xarray.DataArray of
-            time and site, or a Dataset of such; or a pair of arrays, times (T,) and readings (T, sites).
-        time: the column of the times; "t" if not given. In xarray's objects the dimension; "time" or "t".
+            time and site, or a Dataset of such; an array of readings (T, sites) with its times as `time`; or both
+            arrays as a pair.
+        time: the column of the times; "t" if not given. In xarray's objects the dimension; "time" or "t". For an array
+            of readings, the times (T,).
         columns: the columns of u by site: a pattern such as "theta_*_deg", or names; u1, u2, ... if not given. In a
             Dataset also the variable.
         scale: what one unit of a reading is in the equation: a number, or the unit of the readings such as "deg".
@@ -163,10 +167,14 @@ def read(
         'not read: remark'
         >>> import numpy as np
         >>> t = np.linspace(0, 1, 3)
-        >>> lb.read((t, np.cos(t)))
+        >>> lb.read(np.cos(t), time=t)
         Recording(arrays: 1 site, 3 rows)
     """
     chosen = (columns,) if isinstance(columns, str) else tuple(columns)
+    if time is not None and not isinstance(time, str):
+        if not hasattr(source, "dtype") or is_labelled(source):
+            raise InputError("time: an array of times belongs to an array of readings; elsewhere it is a column's name")
+        source, time = (time, cast("ArrayLike", source)), None
     layout = Layout(time, chosen, str(scale), sort, turn, str(time_scale))
     if is_labelled(source):
         table, layout = as_table(source, layout)
@@ -182,7 +190,7 @@ def read(
         or not all(isinstance(one, (str, Path)) for one in source)
     ):
         kind = type(source).__name__
-        raise InputError(f"{kind}: give times and readings as a pair (t, u), a table, or the name of a file")
+        raise InputError(f"{kind}: give an array with its times, lb.read(u, time=t), a table, or the name of a file")
     paths = [source] if isinstance(source, (str, Path)) else list(cast("Sequence[str | Path]", source))
     return Recording(tuple(read_all([Path(str(one)) for one in paths], "unknown", layout)))
 

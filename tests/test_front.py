@@ -309,12 +309,23 @@ def test_arrays_are_read_as_a_file_with_the_same_readings():
         {"scale": "deg"}, {"turn": 360}, {"scale": "deg", "turn": 360, "sort": True}, {"scale": -2.5},
     ):  # fmt: skip
         rows = order if "sort" in words else np.arange(len(t))
-        (one,) = lb.read((t[rows], angle[rows] % 360), **words).samples
+        (one,) = lb.read(angle[rows] % 360, time=t[rows], **words).samples
+        (pair,) = lb.read((t[rows], angle[rows] % 360), **words).samples
+        np.testing.assert_array_equal(pair.u, one.u)
         (other,) = lb.read(frame.iloc[rows], **words).samples
         np.testing.assert_array_equal(one.t, other.t)
         np.testing.assert_array_equal(one.u, other.u)
         assert one.origin.notes == other.origin.notes
         assert (one.origin.scale, one.origin.unit) == (other.origin.scale, other.origin.unit)
+
+
+def test_readings_without_times_and_times_without_readings_are_refused_with_what_is_read():
+    u = np.zeros((4, 2))
+    with pytest.raises(InputError, match=r"lb\.read\(u, time=t\)"):
+        lb.read(u)
+    for source in (pd.DataFrame({"t": [0, 1], "u1": [0, 1]}), "u.csv"):
+        with pytest.raises(InputError, match="it is a column's name"):
+            lb.read(source, time=np.arange(4))
 
 
 def test_none_among_readings_is_a_missing_value():

@@ -100,19 +100,24 @@ def _with_errors(one: Finding, function: Callable[[Placed], Mapping[str, float |
     """
     here = one.placed.numbers
     errors = np.array([error for _, error in one.values.values()])
-    found = {name: value for name, value in function(one.placed).items() if isinstance(value, float)}
+    found = _floats(function(one.placed))
     slopes = {name: np.zeros(len(here)) for name in found}
     for k, error in enumerate(errors):
         step = STEP * (error if error > 0 and np.isfinite(error) else max(abs(here[k]), STEP))
-        moved = function(one.placed.moved(here + step * np.eye(len(here))[k]))
+        moved = _floats(function(one.placed.moved(here + step * np.eye(len(here))[k])))
+        # A name may hold a number that has moved, as the time of a pulse.
+        there = dict(zip(found, moved.values(), strict=True)) if len(moved) == len(found) else moved
         for name, value in found.items():
-            there = moved.get(name)
-            slopes[name][k] = (there - value) / step if isinstance(there, float) else np.nan
+            slopes[name][k] = (there[name] - value) / step if name in there else np.nan
     # A number that something does not rest on says nothing of it, even if it is not known itself.
     return {
         name: Size(value=value, stderr=float(np.linalg.norm((slopes[name] * errors)[slopes[name] != 0])) or np.nan)
         for name, value in found.items()
     }
+
+
+def _floats(numbers: Mapping[str, float | int | str]) -> dict[str, float]:
+    return {name: value for name, value in numbers.items() if isinstance(value, float)}
 
 
 def declared(fitted: Fitted) -> tuple[dict[str, float], dict[str, float]]:

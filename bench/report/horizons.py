@@ -39,12 +39,14 @@ class HorizonReport(Content):
         periods: the same in periods of the motion.
         models: the best one first.
         tried: candidates for the best model, by how far their gain is above their price.
+        misfit: whether the best model leaves so much more than noise that effects must take away a share of it.
     """
 
     samples: int
     periods: Number
     models: tuple[Leading, ...]
     tried: tuple[Candidate, ...]
+    misfit: bool = False
 
 
 def horizons(diagnosis: Diagnosis) -> tuple[HorizonReport, ...]:
@@ -54,6 +56,7 @@ def horizons(diagnosis: Diagnosis) -> tuple[HorizonReport, ...]:
             samples=one.samples, periods=one.periods,
             models=tuple(Leading(effects=effects, behind=behind) for effects, behind in one.models),
             tried=tuple(Candidate(effect=each.name, gain=each.gain, price=each.price) for each in one.tried),
+            misfit=one.misfit,
         )
         for one in diagnosis.horizons
     )  # fmt: skip

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from latticebench.bench.report.units import Units, of_coefficients, with_unit
+from latticebench.diagnosis import rules
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -161,9 +162,29 @@ def tried(report: Report) -> list[Candidate]:
     return list(report.horizons[-1].tried[:SHOWN]) if report.horizons else []
 
 
+def not_chosen(report: Report) -> list[str]:
+    """Return why candidates whose gain is high were not taken."""
+    shown, found = tried(report), []
+    if any(one.gain > one.price for one in shown):
+        found.append(
+            "A gain is what the equation promises as far as it is linear. The best of those above their price were "
+            "fitted in full, beside all that was found: none of these fits was better by its price."
+        )
+    if shown and report.horizons[-1].misfit:
+        found.append(
+            "The model leaves far more than noise, where gains say little: a candidate has to take away "
+            f"{100 * rules.SHARE:g} % of what is left, one with a frequency or a time of its own "
+            f"{100 * rules.SHARE_TIMED:g} %, and its price says so."
+        )
+    return found
+
+
 def left(report: Report) -> Table:
-    """Return what is significant in the last residual."""
-    rows = [[one.effect, _place(one), f"{one.gain:.1f}", f"{one.price:.1f}"] for one in report.left if not one.instead]
+    """Return what is significant in the last residual, the plainest first."""
+    every = [one for one in report.left if not one.instead]
+    rows = [[one.effect, _place(one), f"{one.gain:.1f}", f"{one.price:.1f}"] for one in every[:SHOWN]]
+    if len(every) > SHOWN:
+        rows.append([f"... and {len(every) - SHOWN} more, in the JSON", "", "", ""])
     return ["what", "site", "gain", "price"], rows
 
 

@@ -54,6 +54,8 @@ def _show_search(report: Report) -> None:
     _show_table("\nHow the search went: longer and longer pieces were followed", rows.horizons(report))
     candidates = [[one.effect, f"{one.gain:.1f}", f"{one.price:.1f}"] for one in rows.tried(report)]
     _show_table("What else was tried at last, in nats", (["effect", "gain", "price"], candidates))
+    for line in rows.not_chosen(report):
+        _say(line)
     _show_table("What is left without a name, in nats", rows.left(report))
     _show_table("What does better without a name, in nats", rows.instead(report))
 

@@ -90,6 +90,11 @@ class Scene:
     texts: tuple[str, ...]
     inputs: bool
 
+    @property
+    def seen(self) -> tuple[float, float]:
+        """The times from and to which something was read."""
+        return self.begin, self.begin + self.span
+
     def terms(self, effect: Effect) -> tuple[str, ...]:
         """Return the terms of an effect on this lattice; none where it has no meaning there."""
         texts = effect.texts(self.chain.order, self.chain.is_complex)

@@ -51,11 +51,13 @@ class Pulse(Placed, acts="pulse"):
     Attributes:
         texts: T, or T and i*T for a complex coefficient.
         at, width: in the unit of time.
+        seen: the times from and to which something was read.
     """
 
     texts: tuple[str, ...]
     at: float
     width: float
+    seen: tuple[float, float] = (-np.inf, np.inf)
     shape: ClassVar[tuple[str, ...]] = ("at", "width")
     timed: ClassVar[bool] = True
     separated_by: ClassVar[str] = (
@@ -67,8 +69,9 @@ class Pulse(Placed, acts="pulse"):
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return pulses of several widths all over the recording."""
         texts = scene.terms(effect)
+        still = (0.0,) * len(texts)
         for at, width in bells(scene) if texts else ():
-            yield cls(effect=effect, texts=texts, at=at, width=width, strength=(0.0,) * len(texts))
+            yield cls(effect=effect, texts=texts, at=at, width=width, seen=scene.seen, strength=still)
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the pulse of each term."""
@@ -87,6 +90,11 @@ class Pulse(Placed, acts="pulse"):
         width = min((one.width for one in alike), key=lambda one: abs(np.log(one / own)), default=own)
         apart = [one for one in alike if one.width == width and abs(one.at - self.at) > rules.APART * max(own, width)]
         return sorted(apart, key=lambda one: abs(one.at - self.at))[: rules.AROUND]
+
+    @property
+    def possible(self) -> bool:
+        """Whether its middle is among the readings: of a flank alone, strength, time and width are anything."""
+        return self.seen[0] <= self.at <= self.seen[1]
 
     def begun(self, t: float) -> bool:
         """Return whether its middle is before a time: later, its strength is not known."""

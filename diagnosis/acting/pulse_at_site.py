@@ -18,6 +18,9 @@ class PulseAtSite(AtOneSite, Pulse, acts="pulse at one site"):
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return pulses as they may be at all sites, at every site that has an equation, on a chain of at least two."""
         texts = scene.terms(effect)
-        for site in scene.chain.moving if texts and scene.chain.sites > 1 else ():
+        still = (0.0,) * len(texts)
+        for here in scene.chain.moving if texts and scene.chain.sites > 1 else ():
             for at, width in bells(scene):
-                yield cls(effect=effect, texts=texts, at=at, width=width, strength=(0.0,) * len(texts), here=site)
+                yield cls(
+                    effect=effect, texts=texts, at=at, width=width, seen=scene.seen, strength=still, here=here
+                )  # fmt: skip

@@ -31,7 +31,7 @@ angles = solve_ivp(rate, (0, 25), start, t_eval=t, rtol=1e-9, atol=1e-9).y[:4].T
 readings = angles * [1, 1, 1.25, 1] + 0.005 * draws.normal(size=angles.shape)
 
 model = lb.Model("u[n+1]+u[n-1]-2*u[n]; sin(u[n])", order=2, ends="free")
-cause = lb.diagnose(lb.read((t, readings)), model)
+cause = lb.diagnose(lb.read(readings, time=t), model)
 print(cause)
 print(cause.effects.to_string(index=False))
 

@@ -194,6 +194,17 @@ def test_the_score_finds_a_weak_effect_and_its_strength(way, is_complex):
         assert np.max(np.abs((full.model.numbers[block] - one.numbers) / full.stderr[block])) < 4.5
 
 
+@pytest.mark.parametrize("way", ["pulse", "pulse at one site"])
+def test_a_model_with_a_kick_is_fitted_only_where_its_middle_is_among_the_readings(way):
+    problem, plain = fitted_without(False)
+    kick = candidate(problem, way)
+    begin, end = problem.data[0].t[[0, -1]]
+    for at, fitted in ((begin, True), (end, True), (begin - 0.3, False), (end + 0.3, False)):
+        model = plain.model.with_effect(kick.moved([0.01, at, 0.5]))
+        found = fit(model, plain.layout, plain.followed.nodes, structure=Structure(), noise=plain.noise, steps=2)
+        assert (found is not None) == fitted
+
+
 # Words ----------------------------------------------------------------------------------------------------------------
 
 

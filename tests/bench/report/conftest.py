@@ -27,6 +27,7 @@ from latticebench.diagnosis.acting.everywhere import Everywhere
 from latticebench.diagnosis.acting.gain import Gain
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Noise, Structure
+from latticebench.diagnosis.progress import Horizon, Tried
 from latticebench.systems.effects import Effect, find
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
@@ -74,7 +75,7 @@ def _noise_of(size: list[float], memory: float = 0.0, growth: float = 0.0, tail:
 def _forms(effect: Effect, chain: Chain) -> list[Placed]:
     """An effect as it may stand in a model on a chain, in each of its forms, with numbers of its own."""
     scene: Any = SimpleNamespace(
-        chain=chain, begin=0.0, span=30.0, top=4.0, frequencies=np.array([1.7234567]), inputs=True,
+        chain=chain, begin=0.0, span=30.0, seen=(0.0, 30.0), top=4.0, frequencies=np.array([1.7234567]), inputs=True,
         past=(lambda t: np.zeros((len(t), chain.parts, chain.sites)),), texts=("u[n+1]+u[n-1]-2*u[n]", "sin(u[n])"),
         terms=lambda one: one.texts(chain.order, chain.is_complex),
     )  # fmt: skip
@@ -141,11 +142,8 @@ def _pendula(**changes: Any) -> Any:
         ),
         "verdict": "explained",
         "horizons": (
-            SimpleNamespace(samples=20, periods=0.5, models=((("sensor-gain",), 0.0), (("memory",), 3.2)), tried=()),
-            SimpleNamespace(
-                samples=800, periods=20.0, models=((("damping", "sensor-gain"), 0.0),),
-                tried=tuple(SimpleNamespace(name=name, gain=gain, price=7.0) for name, gain in tried),
-            ),
+            Horizon(20, 0.5, ((("sensor-gain",), 0.0), (("memory",), 3.2)), ()),
+            Horizon(800, 20.0, ((("damping", "sensor-gain"), 0.0),), tuple(Tried(*one, 7.0) for one in tried)),
         ),
         "inputs": "", "dead": (), "left": (),
         "data": (Samples(t, seen, source="pendula.csv", ends="free"),), "used": (800, 800),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,6 +19,7 @@ from latticebench.bench.report.curves import curves
 from latticebench.bench.report.document import Provenance, to_dict
 from latticebench.bench.report.page import page, write_page
 from latticebench.bench.report.whereabouts import spectrum
+from latticebench.diagnosis.repair import SMALL
 from latticebench.systems.errors import InputError
 
 Made = Callable[..., Any]
@@ -90,6 +92,25 @@ def test_candidates_have_bars_and_the_mark_of_their_price(pendula: Made) -> None
     assert text.count('class="alike"') == 1
     assert "price 7.0" in text
     assert "What else was tried" not in page_of(pendula(horizons=pendula().horizons[:1]))
+
+
+def test_why_effects_explain_a_part_only_stands_beside_the_verdict(pendula: Made) -> None:
+    left = (SimpleNamespace(name="u[n]**4", gain=31.0, price=9.5, site=None, instead=()),)
+    assert f">{SMALL}</span>" in page_of(pendula(left=left, verdict="partly explained"))
+    assert SMALL not in page_of(pendula())
+
+
+def test_why_a_candidate_above_its_price_was_not_taken_is_said(pendula: Made) -> None:
+    (fitted,) = rows.not_chosen(content(pendula()))
+    assert "fitted in full" in fitted
+    assert fitted in html.unescape(page_of(pendula()))
+    first, last = pendula().horizons
+    below = tuple(replace(one, gain=one.price - 1) for one in last.tried)
+    assert rows.not_chosen(content(pendula(horizons=(first, replace(last, tried=below))))) == []
+    (share,) = rows.not_chosen(content(pendula(horizons=(first, replace(last, tried=below, misfit=True)))))
+    assert "10 % of what is left" in share
+    assert "50 %" in share
+    assert rows.not_chosen(content(pendula(horizons=(first, replace(last, tried=(), misfit=True))))) == []
 
 
 def test_a_forecast_that_runs_away_is_said_to_and_hides_no_readings(pendula: Made) -> None:

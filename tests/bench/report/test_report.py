@@ -22,6 +22,7 @@ from latticebench.bench.report.text import show
 from latticebench.bench.report.whereabouts import scaled_residuals, whereabouts
 from latticebench.diagnosis.acting import Chain, Placed
 from latticebench.diagnosis.acting.everywhere import Everywhere
+from latticebench.diagnosis.acting.pulse import Pulse
 from latticebench.diagnosis.noise import Noise
 from latticebench.diagnosis.repair import NAMELESS, NOT_FOLLOWED, NOT_REACHED, SMALL
 from latticebench.systems.effects import CATALOGUE, Effect, find
@@ -52,6 +53,17 @@ def test_a_gain_is_said_as_a_factor_and_a_damping_as_a_decay_time_with_their_err
     assert damping.natural["decay time"].value == pytest.approx(20)
     assert damping.natural["decay time"].stderr == pytest.approx(20 * damping.stderr["v[n]"] / 0.1, rel=1e-2)
     assert any("1/e within 20" in line for line in damping.said)
+
+
+def test_a_kick_whose_time_is_hardly_known_has_all_its_standard_errors(pendula: Made) -> None:
+    kick = Pulse(effect=find("kick"), texts=("1",), at=16.4, width=0.4, strength=(30.0,))
+    (label,) = kick.labels(pendula().after.chain)
+    known = {label: (30.0, 14.0), "at": (16.4, 0.4), "width": (0.4, 0.2)}
+    one = SimpleNamespace(placed=kick, alternatives=(), evidence=20.0, values=known, name="kick")
+    (effect,) = added(pendula(findings=(one,)))
+    for name, (value, error) in known.items():
+        assert effect.natural[name].value == pytest.approx(value)
+        assert effect.natural[name].stderr == pytest.approx(error)
 
 
 def test_a_linear_force_is_said_as_a_change_of_the_frequency_too(pendula: Made) -> None:
@@ -149,6 +161,10 @@ def test_what_is_left_without_a_name_is_told_with_its_site(pendula: Made, capsys
     assert report.partly == (SMALL,)
     show(report)
     assert "u[n]**4" in capsys.readouterr().out
+    many = tuple(SimpleNamespace(name=f"u[n]**{k}", gain=31.0, price=9.5, site=None, instead=()) for k in range(4, 24))
+    table = rows.left(content(pendula(left=many, verdict="partly explained")))[1]
+    assert len(table) == rows.SHOWN + 1
+    assert table[-1][0] == "... and 12 more, in the JSON"
 
 
 def test_what_does_better_than_an_effect_in_its_place_is_said_so(
