@@ -30,6 +30,7 @@ from latticebench.systems.arrays import free_memory
 from latticebench.systems.effects import Effect
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
+from latticebench.systems.options import option
 from latticebench.systems.samples import Samples, SimulatedSamples
 
 if TYPE_CHECKING:
@@ -249,7 +250,8 @@ def _check_outer(problem: Problem) -> None:
             first, last = (0, site) if site < moving[0] else (site, sites - 1)
             raise InputError(
                 f"{problem.data[0].source}: u{site + 1} has no readings; what a site near an unknown end does can only "
-                f"be read. Leave all columns from u{first + 1} to u{last + 1} out, or say how the chain ends (--ends)"
+                f"be read. Leave all columns from u{first + 1} to u{last + 1} out, or say how the chain ends "
+                f"({option('ends')})"
             )
 
 
@@ -280,7 +282,7 @@ def _check_room(problem: Problem) -> None:
         raise InputError(
             f"{problem.data[0].source}: a diagnosis of {problem.chain.sites} sites would take at least "
             f"{needed / 2**30:.2g} GiB, and {there / 2**30:.2g} GiB may be used; give some of the sites, with "
-            "--columns or in a file of their own, or fewer rows"
+            f"{option('columns')} or in a file of their own, or fewer rows"
         )
 
 

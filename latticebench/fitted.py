@@ -23,6 +23,7 @@ from latticebench.pictures import Picture
 from latticebench.recording import Model, Recording
 from latticebench.systems.errors import InputError
 from latticebench.systems.motion import Motion
+from latticebench.systems.options import called_from_python
 from latticebench.systems.samples import Origin, Samples
 from latticebench.systems.simulate import integrate
 from latticebench.systems.terms import combination
@@ -262,6 +263,7 @@ class Fitted(Exhibit):
         return f"{lines}{told}{html_table(self.table, index=True)}<p>{html.escape(self.quality.in_words)}</p>"
 
 
+@called_from_python
 def fit(data: Recording, model: Model, method: str = methods.DEFAULT, seed: int = 1, **settings: Any) -> Fitted:
     """Fit the coefficients of a model to a recording.
 

@@ -31,6 +31,7 @@ from latticebench.exhibit import Exhibit
 from latticebench.pictures import FROM_PYTHON
 from latticebench.recording import Model, Recording
 from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.options import called_from_python
 
 if TYPE_CHECKING:
     from latticebench.bench.limit import Design, Limit
@@ -160,6 +161,7 @@ class Cause(Exhibit):
         return f'<iframe srcdoc="{html.escape(self.page)}" style="width:100%;height:40em;border:0"></iframe>'
 
 
+@called_from_python
 def diagnose(
     data: Recording, model: Model, *, effects: str | Path | None = None, holdout: Recording | None = None
 ) -> Cause:
@@ -233,6 +235,7 @@ class Bound:
         return f"{lines}{html_table(self.table, index=True)}<p>{'<br>'.join(map(html.escape, self.notes))}</p>"
 
 
+@called_from_python
 def limit(data: Recording, model: Model, target: float = 0.01) -> Bound:
     """Return how well any method could know a model's coefficients from a recording.
 

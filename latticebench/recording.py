@@ -25,6 +25,7 @@ from latticebench.pictures import Film, Picture, Survey
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library, library
 from latticebench.systems.layout import Layout
+from latticebench.systems.options import called_from_python
 from latticebench.systems.readers import from_arrays, from_frame, read_all
 from latticebench.systems.samples import Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
@@ -101,6 +102,7 @@ class Recording:
         """
         return Film(of_recording(_one_of(self, trajectory)))
 
+    @called_from_python
     def inspect(self, model: Model | None = None) -> Inspected:
         """Return what the recording is like, and what is suspicious; with a model, whether it makes sense in that."""
         library = None if model is None else model.library
@@ -117,6 +119,7 @@ class Recording:
         return f"<p>{html.escape(repr(self))}</p>{html_table(self.to_frame().head())}"
 
 
+@called_from_python
 def read(
     source: str
     | Path
@@ -364,6 +367,7 @@ OBSERVED = (
 UNBOUNDED = "latticebench.systems.simulate.simulate has no limits"
 
 
+@called_from_python
 def simulate(name: str, parameters: Mapping[str, float] | None = None, **observed: Any) -> Recording:
     """Return a simulated recording of a system, as `latticebench simulate` writes it; all is dimensionless.
 

@@ -30,6 +30,7 @@ from latticebench.methods.engine.bounds import checked
 from latticebench.systems.arrays import free_memory
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library
+from latticebench.systems.options import option
 from latticebench.systems.samples import Samples, SimulatedSamples
 from latticebench.systems.stencil import ghosts, observed
 
@@ -312,7 +313,7 @@ def check_fit(data: Sequence[Samples], library: Library, order: int) -> None:
         if library.uses("i") and not samples.is_complex:
             raise InputError(f"{samples.source}: the library uses i, but the field is real; leave the terms with i out")
     if library.uses("v") and order == 1:
-        raise InputError("the library uses v[n], but an equation of order 1 has no velocity; use --order 2")
+        raise InputError(f"the library uses v[n], but an equation of order 1 has no velocity; use {option('order', 2)}")
     _check_read(data, library)
 
 
@@ -329,7 +330,7 @@ def _check_read(data: Sequence[Samples], library: Library) -> None:
     raise InputError(
         f"{first.source}: nothing was ever read of {first.columns(first.unread)}, and only "
         f"{inner.stop - inner.start} site(s) have an equation: no coefficient can be determined; say how the chain "
-        "ends (--ends), take terms with fewer neighbours, or give readings of these sites"
+        f"ends ({option('ends')}), take terms with fewer neighbours, or give readings of these sites"
     )
 
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.options import option, options
 from latticebench.systems.samples import Origin
 
 # What one of a unit is in the unit of the equation.
@@ -68,7 +69,8 @@ class Layout:
         """
         if not (math.isfinite(self.turn) and self.turn >= 0):
             raise InputError(
-                f"--turn {self.turn:g}: a full turn is a finite number above 0 in the unit of the file, such as 360"
+                f"{option('turn', self.turn)}: a full turn is a finite number above 0 in the unit of the file, "
+                "such as 360"
             )
         return self.turn
 
@@ -84,7 +86,7 @@ class Layout:
             return UNITS[unit][0]
         value = _number(self.scale)
         if not math.isfinite(value) or value == 0:
-            raise InputError(f"{unknown('scale', self.scale, UNITS, '--scale')}; or a number such as 1e-3")
+            raise InputError(f"{unknown('scale', self.scale, UNITS, option('scale'))}; or a number such as 1e-3")
         return value
 
     @property
@@ -99,7 +101,7 @@ class Layout:
             return TIMES[unit]
         value = _number(self.time_scale)
         if not (math.isfinite(value) and value > 0):
-            told = unknown("scale", self.time_scale, TIMES, "--time-scale")
+            told = unknown("scale", self.time_scale, TIMES, option("time-scale"))
             raise InputError(f"{told}; or a number above 0 such as 1e-3")
         return value
 
@@ -174,7 +176,7 @@ def choose(header: Sequence[str], layout: Layout, source: str, units: Mapping[st
     time = layout.time or "t"
     if time not in header:
         if layout.time is not None:
-            raise unknown("column", time, header, f"{source}: --time")
+            raise unknown("column", time, header, f"{source}: {option('time')}")
         raise InputError(f"{source}: there is no column t, {_told(header)}{suggestion(header, layout)}")
     chosen = _columns(header, layout, source)
     names = {time: "t"} | chosen
@@ -208,15 +210,16 @@ def _columns(header: Sequence[str], layout: Layout, source: str) -> dict[str, st
         for one in [asked] if asked in header else [part.strip() for part in asked.split(",")]:
             matching = [one] if one in header else _matching(header, one)
             if not matching:
-                raise unknown("column", one, header, f"{source}: --columns")
+                raise unknown("column", one, header, f"{source}: {option('columns')}")
             for name in matching:
                 if name in found:
-                    raise InputError(f"{source}: --columns: {quoted(name)} is named twice; name each column once")
+                    where = f"{source}: {option('columns')}"
+                    raise InputError(f"{where}: {quoted(name)} is named twice; name each column once")
                 found.append(name)
     if (layout.time or "t") in found:
         raise InputError(
-            f"{source}: --columns: {quoted(layout.time or 't')} is the column of the times; choose others, "
-            'such as --columns "theta_*"'
+            f"{source}: {option('columns')}: {quoted(layout.time or 't')} is the column of the times; choose others, "
+            f"such as {option('columns', 'theta_*')}"
         )
     return {name: f"u{number}" for number, name in enumerate(found, 1)}
 
@@ -246,11 +249,12 @@ def _origin(layout: Layout, time: str, columns: Sequence[str], told: Mapping[str
         raise InputError(f"{source}: the columns of u are in different units ({listed}); choose those of one unit")
     unit = next(iter(units), "")
     if layout.unit and unit and unit != layout.unit:
-        raise InputError(f"{source}: --scale {layout.scale}: the columns say that they are in {unit}")
+        raise InputError(f"{source}: {option('scale', layout.scale)}: the columns say that they are in {unit}")
     unit, factor = unit or layout.unit, layout.factor
     becomes = unit if factor == 1 else UNITS[layout.unit][1] if layout.unit else ""
     if layout.time_unit and told[time] and told[time] != layout.time_unit:
-        raise InputError(f"{source}: --time-scale {layout.time_scale}: column {time} says that it is in {told[time]}")
+        where = f"{source}: {option('time-scale', layout.time_scale)}"
+        raise InputError(f"{where}: column {time} says that it is in {told[time]}")
     return Origin(
         time="s" if layout.time_unit else told[time] if layout.time_factor == 1 else "",
         unit=unit,
@@ -276,7 +280,9 @@ def _notes(layout: Layout, origin: Origin, time: str, left: Sequence[str]) -> li
     elif layout.time_factor != 1:
         notes.append(times)
     if origin.unit in ("deg", "arcmin") and origin.scale == 1:
-        notes.append(f"angles are taken in {origin.unit}, as they are; --scale {origin.unit} makes them radians")
+        notes.append(
+            f"angles are taken in {origin.unit}, as they are; {option('scale', origin.unit)} makes them radians"
+        )
     if left:
         notes.append(f"not read: {', '.join(quoted(name)[1:-1] for name in left[:LISTED])}"
                      f"{f' and {len(left) - LISTED} more' if len(left) > LISTED else ''}")  # fmt: skip
@@ -318,14 +324,13 @@ def suggestion(header: Sequence[str], layout: Layout) -> str:
             families.setdefault(re.sub(r"\d+", "*", name, count=1), []).append(name)
     pattern, members = max(families.items(), key=lambda one: ("*" in one[0]) * len(one[1]), default=("", []))
     if time is None or not members or len(pattern) > 60 or ("*" not in pattern and len(families) > 1):
-        return '; name the columns with --time and --columns, such as --time time_s --columns "theta_*_deg"'
+        such = options(time="time_s", columns="theta_*_deg")
+        return f"; name the columns with {option('time')} and {option('columns')}, such as {such}"
     unit = unit_of(members[0])
-    scale = f" --scale {unit}" if unit in ("deg", "arcmin") and layout.scale == "1" else ""
+    given: dict[str, str | float | bool] = {} if time == "t" else {"time": time}
+    given["columns"] = pattern
+    if unit in ("deg", "arcmin") and layout.scale == "1":
+        given["scale"] = unit
     if unit_of(time) in set(TIMES) - {"s"} and layout.time_scale == "1":
-        scale += f" --time-scale {unit_of(time)}"
-    options = ("" if time == "t" else f" --time {_argument(time)}") + f' --columns "{pattern}"{scale}'
-    return f"; read it with{options}"
-
-
-def _argument(text: str) -> str:
-    return text if re.fullmatch(r"[\w.-]+", text) else f'"{text}"'
+        given["time_scale"] = unit_of(time)
+    return f"; read it with {options(**given)}"

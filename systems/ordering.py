@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.systems.errors import InputError
+from latticebench.systems.options import option
 
 if TYPE_CHECKING:
     from numpy import ndarray
@@ -36,7 +37,8 @@ def in_order(arrays: Arrays, source: str, column: str, *, sort: bool) -> tuple[A
         return arrays, []
     if not sort:
         row = int(np.flatnonzero(steps <= 0)[0]) + 1
-        remedy = "--sort averages rows of the same time" if t[row] == t[row - 1] else "--sort puts the rows in order"
+        does = "averages rows of the same time" if t[row] == t[row - 1] else "puts the rows in order"
+        remedy = f"{option('sort', True)} {does}"
         raise InputError(
             f"{source}: row {row + 1}, column {column}: time {t[row]:g} after {t[row - 1]:g}; times must "
             f"increase: {remedy}; several trajectories need a column 'trajectory'"
@@ -58,7 +60,7 @@ def unwrapped(u: ndarray, turn: float, source: str) -> ndarray:
         InputError: they are complex.
     """
     if np.iscomplexobj(u):
-        raise InputError(f"{source}: --turn is for angles; these readings are complex")
+        raise InputError(f"{source}: {option('turn')} is for angles; these readings are complex")
     found = np.array(u, float)
     for column in found.T:
         seen = np.isfinite(column)

@@ -23,6 +23,7 @@ from latticebench.systems.files import DATA, check_regular, reading, shown
 from latticebench.systems.folders import ZARR, files_in, partition, zarr_arrays
 from latticebench.systems.layout import UNITS, Layout, choose, quoted
 from latticebench.systems.npz import ARRAYS, check_names, read_npz
+from latticebench.systems.options import option
 from latticebench.systems.ordering import averaged, in_order, unwrapped
 from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
@@ -250,7 +251,8 @@ def _from_table(table: Table, source: str, ends: Ends, layout: Layout) -> list[S
         origin = origin.noting(f"{count} cell(s) with a dash are taken as missing")
     body, said = _with_seconds(body, choice.names["t"], source)
     if said and layout.time_factor != 1:
-        raise InputError(f"{source}: --time-scale {layout.time_scale}: dates become seconds already; leave it out")
+        where = f"{source}: {option('time-scale', layout.time_scale)}"
+        raise InputError(f"{where}: dates become seconds already; leave it out")
     if said:
         origin = replace(origin.noting(said), time="s")
     numbers = {new: _numbers(body, old, source) for new, old in choice.names.items() if new != "trajectory"}
@@ -392,7 +394,9 @@ def _given(values: ArrayLike, name: str, source: str) -> ndarray:
 
 def _from_arrays(arrays: dict[str, ndarray], source: str, ends: Ends, layout: Layout) -> list[Samples]:
     if layout.time is not None or layout.columns:
-        raise InputError(f"{source}: it has arrays t and u, no columns; leave --time and --columns out")
+        raise InputError(
+            f"{source}: it has arrays t and u, no columns; leave {option('time')} and {option('columns')} out"
+        )
     _check_times(arrays["t"], source)
     t, labels = arrays["t"], arrays.get("trajectory")
     u, v, f = (_matrix(arrays, name, source) for name in ("u", "v", "f"))

@@ -196,7 +196,7 @@ def test_recordings_in_xarray_are_read_as_they_are_labelled():
 def test_a_fit_of_degrees_warns_before_anything_else_and_names_a_remedy():
     found = lb.fit(swing(scale=600), PENDULUM, method="least-squares")
     assert repr(found).startswith("Warning: the equation does not fit")
-    assert any("--scale deg" in line for line in found.warnings)
+    assert any("scale='deg'" in line for line in found.warnings)
     assert "<b>Warning:</b>" in found._repr_html_()
 
 
@@ -337,10 +337,10 @@ def test_the_turn_that_is_advised_for_arrays_in_degrees_unwraps_them():
     t = np.arange(0, 10, 0.05)
     anew = (t, 360 * (0.6 * t - 0.02 * t**2) % 360)
     told = " ".join(lb.read(anew, scale="deg").inspect().suspicious)
-    (turn,) = re.findall(r"--turn (\S+)", told)
+    (turn,) = re.findall(r"turn=(\S+)", told)
     data = lb.read(anew, scale="deg", turn=float(turn))
     assert data.notes == ("angles are unwrapped (a full turn is 360 deg)",)
-    assert "--turn" not in " ".join(data.inspect().suspicious)
+    assert "turn=" not in " ".join(data.inspect().suspicious)
 
 
 @pytest.mark.parametrize(
@@ -353,9 +353,9 @@ def test_the_turn_that_is_advised_for_arrays_in_degrees_unwraps_them():
         (([0, 1], [[1, 2], [3]]), {}, "array u is none of numbers"),
         (([0, 1], ["a", "b"]), {}, "array u: its values are <U1, not numbers"),
         (([0, 1j], [1, 2]), {}, "array t: times are real"),
-        (([1, 0], [1, 2]), {}, "--sort puts the rows in order"),
-        (([0, 1], [1j, 2]), {"turn": 360}, "--turn is for angles"),
-        (([0, 1], [1, 2]), {"columns": "x"}, "leave --time and --columns out"),
+        (([1, 0], [1, 2]), {}, "sort=True puts the rows in order"),
+        (([0, 1], [1j, 2]), {"turn": 360}, "turn is for angles"),
+        (([0, 1], [1, 2]), {"columns": "x"}, "leave time and columns out"),
     ],
 )
 def test_arrays_that_are_no_recording_are_refused_by_name_and_shape(pair, words, reason):

@@ -12,6 +12,7 @@ from latticebench.bench.report.units import with_unit
 from latticebench.diagnosis.instrument import step_of
 from latticebench.diagnosis.modes import MOST_MODES
 from latticebench.systems.layout import UNITS
+from latticebench.systems.options import option
 from latticebench.systems.samples import Samples
 
 if TYPE_CHECKING:
@@ -72,7 +73,8 @@ def degrees(samples: Samples, terms: Library) -> list[str]:
     if samples.origin.becomes == "rad":
         return []
     known = unit in ("deg", "arcmin")
-    remedy = f"read the angles with --scale {unit}" if known else "if these are degrees: --scale deg"
+    remedy = option("scale", unit if known else "deg")
+    remedy = f"read the angles with {remedy}" if known else f"if these are degrees: {remedy}"
     return [f"u reaches {largest:.3g} in {names[0]}(...), which takes radians; {remedy}"]
 
 
@@ -162,7 +164,7 @@ def turns(samples: Samples) -> list[str]:
                 found.append(
                     f"{samples.source}: u{site + 1} jumps by about {turn:.4g} at {np.sum(anew)} places and moves by no "
                     f"more than {np.max(rest):.2g} elsewhere. It looks like an angle that starts anew after a full "
-                    f"turn; --turn {turn:.16g} unwraps it."
+                    f"turn; {option('turn', float(turn))} unwraps it."
                 )
     return found
 

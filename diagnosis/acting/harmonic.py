@@ -21,39 +21,54 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Wave(InStep):
-    """The factor t**power * cos(omega t), or sin(omega t), the same at all sites.
+    """The factor s**power * cos(omega s), or sin(omega s), with s = t - middle, the same at all sites.
 
     Attributes:
         name: "cos" or "sin".
         omega: angular frequency, one over the unit of time.
-        power: of the time, for derivatives by omega.
+        middle: the time of phase zero.
+        power: of s, for derivatives by omega.
     """
 
     name: Literal["cos", "sin"]
     omega: float
+    middle: float = 0.0
     power: int = 0
 
     def __call__(self, t: ndarray) -> ndarray:
         """Return its values (1, B, 1)."""
         function = np.cos if self.name == "cos" else np.sin
-        return np.asarray((t**self.power * function(self.omega * t))[None, :, None])
+        s = t - self.middle
+        return np.asarray((s**self.power * function(self.omega * s))[None, :, None])
 
     def __str__(self) -> str:
         """Return it in the term language."""
-        return f"t**{self.power}*{self.name}({self.omega!r}*t)" if self.power else f"{self.name}({self.omega!r}*t)"
+        s = since(self.middle)
+        return f"{f'{s}**{self.power}*' if self.power else ''}{self.name}({self.omega!r}*{s})"
+
+
+def since(middle: float) -> str:
+    """Return the time since another one, in the term language.
+
+    >>> since(0.0), since(12.5), since(-3.0)
+    ('t', '(t-12.5)', '(t+3)')
+    """
+    return f"(t{-middle:+.15g})" if middle else "t"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Harmonic(Placed, acts="harmonic"):
-    """A term times a cos(omega t) + b sin(omega t), at every site alike.
+    """A term times a cos(omega s) + b sin(omega s) with s = t - middle, at every site alike.
 
     Attributes:
         texts: T, or T and i*T for complex coefficients.
         omega: angular frequency, one over the unit of time.
+        middle: the time of phase zero, near the middle of the recording, where phase and frequency are independent.
     """
 
     texts: tuple[str, ...]
     omega: float
+    middle: float = 0.0
     shape: ClassVar[tuple[str, ...]] = ("omega",)
     timed: ClassVar[bool] = True
     separated_by: ClassVar[str] = (
@@ -66,11 +81,12 @@ class Harmonic(Placed, acts="harmonic"):
         """Return every frequency of the scene."""
         texts = scene.terms(effect)
         for omega in scene.frequencies if texts else ():
-            yield cls(effect=effect, texts=texts, omega=float(omega), strength=(0.0,) * (2 * len(texts)))
+            still = (0.0,) * (2 * len(texts))
+            yield cls(effect=effect, texts=texts, omega=float(omega), middle=scene.middle, strength=still)
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return cosine and sine of each term."""
-        waves = (f"{name}({self.omega:.6g}*t)" for name in ("cos", "sin"))
+        waves = (f"{name}({self.omega:.6g}*{since(self.middle)})" for name in ("cos", "sin"))
         return tuple(wave if text == "1" else f"{wave}*{text}" for wave in waves for text in self.texts)
 
     @property
@@ -101,13 +117,13 @@ class Harmonic(Placed, acts="harmonic"):
         for k, text in enumerate(self.texts):
             a, b = self.strength[k], self.strength[count + k]
             found += [
-                Force(text, a, {k: 1.0}, share, Wave("cos", self.omega)),
-                Force(text, b, {count + k: 1.0}, share, Wave("sin", self.omega)),
+                Force(text, a, {k: 1.0}, share, Wave("cos", self.omega, self.middle)),
+                Force(text, b, {count + k: 1.0}, share, Wave("sin", self.omega, self.middle)),
             ]
             if a or b:
                 found += [
-                    Force(text, 0.0, {last: -a}, share, Wave("sin", self.omega, 1)),
-                    Force(text, 0.0, {last: b}, share, Wave("cos", self.omega, 1)),
+                    Force(text, 0.0, {last: -a}, share, Wave("sin", self.omega, self.middle, 1)),
+                    Force(text, 0.0, {last: b}, share, Wave("cos", self.omega, self.middle, 1)),
                 ]
         return found
 
@@ -115,6 +131,9 @@ class Harmonic(Placed, acts="harmonic"):
         """Return the waves."""
         import sympy
 
-        phase = sympy.Float(self.omega, 6) * sympy.Symbol("t", real=True)
+        t = sympy.Symbol("t", real=True)
+        # Unevaluated, so that SymPy does not multiply the bracket out.
+        since_then = sympy.UnevaluatedExpr(t - sympy.Float(f"{self.middle:.15g}")) if self.middle else t
+        phase = sympy.Float(self.omega, 6) * since_then
         bodies = [wave(phase) * Term(text).in_decimals for wave in (sympy.cos, sympy.sin) for text in self.texts]
         return [Summand(*one) for one in zip(self.labels(chain), self.strength, bodies, strict=True)]

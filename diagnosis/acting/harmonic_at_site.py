@@ -12,12 +12,15 @@ from latticebench.systems.effects import Effect
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HarmonicAtSite(AtOneSite, Harmonic, acts="harmonic at one site"):
-    """A term times a cos(omega t) + b sin(omega t) at one site, nothing elsewhere."""
+    """A term times a cos(omega s) + b sin(omega s) with s = t - middle at one site, nothing elsewhere."""
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return every frequency of the scene at every site that has an equation, on a chain of at least two."""
         texts = scene.terms(effect)
-        for site in scene.chain.moving if texts and scene.chain.sites > 1 else ():
+        still = (0.0,) * (2 * len(texts))
+        for here in scene.chain.moving if texts and scene.chain.sites > 1 else ():
             for omega in scene.frequencies:
-                yield cls(effect=effect, texts=texts, omega=float(omega), strength=(0.0,) * (2 * len(texts)), here=site)
+                yield cls(
+                    effect=effect, texts=texts, omega=float(omega), middle=scene.middle, strength=still, here=here
+                )  # fmt: skip

@@ -31,6 +31,8 @@ WAYS: dict[str, type[Placed]] = {}
 DIGITS = 4
 # On fewer sites a dependence on the place cannot be told from what single sites have.
 PLACES = 4
+# A round time near the middle of a recording is a multiple of the power of ten below this share of its span.
+OF_THE_SPAN = 0.05
 # What tells instrument from motion, and one site from all.
 OTHER_SENSORS = (
     "the same motion read by other sensors, or by these at other sites: a fault goes with the sensor, physics stays "
@@ -94,6 +96,12 @@ class Scene:
     def seen(self) -> tuple[float, float]:
         """The times from and to which something was read."""
         return self.begin, self.begin + self.span
+
+    @property
+    def middle(self) -> float:
+        """A round time near the middle of the longest recording: about it, phases hardly depend on frequencies."""
+        unit = 10.0 ** np.floor(np.log10(OF_THE_SPAN * self.span))
+        return float(unit * np.round((self.begin + self.span / 2) / unit))
 
     def terms(self, effect: Effect) -> tuple[str, ...]:
         """Return the terms of an effect on this lattice; none where it has no meaning there."""

@@ -20,6 +20,7 @@ from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.method import Abilities
 from latticebench.systems.arrays import pieces, rows_of
 from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.options import option, setting
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -181,7 +182,7 @@ def _spline(t: ndarray, fields: Iterable[ndarray], *, smooth: bool) -> Callable[
     if len(t) <= DEGREE:
         raise InputError(
             f"a quintic spline needs at least {DEGREE + 1} samples, there are {len(t)}; "
-            "give more, or use --set differentiation=FiniteDifference"
+            f"give more, or use {setting('differentiation', 'FiniteDifference')}"
         )
     # The fit lives on [0, 1], so that the penalty's size does not depend on the unit of time.
     span = t[-1] - t[0]
@@ -235,8 +236,8 @@ def _smoothing(x: ndarray, splines: BSplines, fields: Iterable[ndarray]) -> Call
         steps = np.diff(x)
         raise InputError(
             f"the longest of its steps in time is {np.max(steps) / np.min(steps):.0e} times the shortest, too much for "
-            "a spline; cut the recording into trajectories, or fit it by --method stlsq --set "
-            "differentiation=FiniteDifference"
+            f"a spline; cut the recording into trajectories, or fit it by {option('method', 'stlsq')} with "
+            f"{setting('differentiation', 'FiniteDifference')}"
         ) from None
     d = np.maximum(d, 0.0)
     power, outside = np.zeros(count), 0.0

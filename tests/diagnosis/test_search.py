@@ -50,6 +50,15 @@ def test_a_strong_force_below_the_motions_own_frequency_is_named(driven):
     assert force.name == "drive"
     assert force.placed.frequency == pytest.approx(0.6, abs=0.001)
     assert "damping" in (friction.name, *friction.alternatives)
+    # The same by a clock that counts from 1970 on: the phase is known about the middle of the recording.
+    later = diagnose(SPRING, 2, [replace(driven, t=driven.t + 1.7e9)], CATALOGUE)
+    assert [one.name for one in later.findings] == [one.name for one in found.findings]
+    sizes, same = (np.array(list(one.findings[0].values.values())) for one in (found, later))
+    np.testing.assert_allclose(sizes[:, 0], same[:, 0], atol=0.02 * np.min(sizes[:, 1]))
+    np.testing.assert_allclose(sizes[:, 1], same[:, 1], rtol=0.02)
+    cosine, sine, _ = sizes
+    assert np.hypot(cosine[0], sine[0]) == pytest.approx(0.3, abs=5 * cosine[1])
+    assert np.max(sizes[:2, 1]) < 0.02
 
 
 @pytest.mark.parametrize("omega", [0.7, 3.0])

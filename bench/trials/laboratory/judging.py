@@ -37,6 +37,8 @@ POWERS = {
     "nonlinear-coupling": -2, "quadratic-drag": -1, "nonlinear-damping": -2, "dry-friction": 1, "constant-force": 1,
     "drive": 1, "local-drive": 1, "sensor-curve": -2, "sensor-gain": -1,
 }  # fmt: skip
+# The label of a wave, and minus the time since which its phase is counted.
+WAVE = r"(cos|sin)\(.*\*(?:t|\(t([+-][^()]*)\))\)"
 # Labels of values that are no coefficient of a term, with the names that recordings have for them.
 NAMED = {"omega": "omega", "curve of u": "curve", "scale": "scale"}
 # Half the width of a 95 % interval, in standard errors.
@@ -80,11 +82,12 @@ def called(values: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
     """
     found = {}
     for label, (value, error) in values.items():
-        sensor, wave = re.match(r"(offset|gain) of u(\d+)", label), re.match(r"(cos|sin)\(.*\*t\)", label)
+        sensor, wave = re.match(r"(offset|gain) of u(\d+)", label), re.match(WAVE, label)
         if sensor is not None:
             found[f"{sensor[1]}_{sensor[2]}"] = (value + (sensor[1] == "gain"), error)
         elif wave is not None:
             found[wave[1]] = (value, error)
+            found["middle"] = (-float(wave[2] or 0), 0.0)
         else:
             found[NAMED.get(label, "coefficient")] = (value, error)
     return found
@@ -216,13 +219,20 @@ def _unit(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], pairs: S
 
 
 def _said_in(unit: float, one: Mapping[str, Any], values: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Return the true parameters of an effect as those that are found count them: from the same zeros, in that unit."""
+    """Return the true parameters of an effect as those that are found count them: from the same zeros, in that unit.
+
+    The phase of a drive is that at the time from which what was found counts.
+    """
     true, beside = dict(one["parameters"]), one.get("beside") or {}
     # No outer sensor is named: their zeros are taken as right.
     if beside and not any(name in values for name in true if name not in beside):
         true = dict(beside)
     if unit != 1 and one["name"] == "sensor-gain":
         true = {name: true.get(name, 1.0) for name in values}
+    if "middle" in values and "omega" in true:
+        phase = true["omega"] * values["middle"][0]
+        cos, sin = true["cos"], true["sin"]
+        true["cos"], true["sin"] = cos * np.cos(phase) + sin * np.sin(phase), sin * np.cos(phase) - cos * np.sin(phase)
     factor = unit ** POWERS.get(one["name"], 0)
     return {name: value if name == "omega" else value * factor for name, value in true.items()}
 

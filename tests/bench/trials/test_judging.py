@@ -111,6 +111,12 @@ def test_gains_and_coefficients_are_compared_in_the_unit_of_the_sensor_that_is_t
         said("drive", cos=(1.0, 0.01), sin=(0.0, 0.01), omega=(7.0, 0.01)),
     ]
     assert judge(truth, said_so).covered == (6, 6)
+    # The same drive, its phase counted from t = 0.3 on.
+    cos, sin = np.cos(2.1), -np.sin(2.1)
+    said_so[2] = said("drive", cos=(cos, 0.01), sin=(sin, 0.01), omega=(7.0, 0.01), middle=(0.3, 0.0))
+    assert judge(truth, said_so).covered == (6, 6)
+    said_so[2] = said("drive", cos=(cos, 0.01), sin=(sin, 0.01), omega=(7.0, 0.01), middle=(0.0, 0.0))
+    assert judge(truth, said_so).covered == (4, 6)
     of_two = {**there("sensor-gain", 1, gain_2=0.5), "sites": [0, 1]}
     assert judge([of_two], [said("sensor-gain", 0, gain_1=(2.0, 0.01))]).covered == (1, 1)
     # A sensor that does not do the same has no such unit.
@@ -140,8 +146,11 @@ def test_values_have_the_names_that_recordings_have_for_them() -> None:
     found = called({label: (value, 0.1) for label, value in labels.items()})
     assert {name: value for name, (value, _) in found.items()} == {
         "offset_1": 1.0, "gain_12": 1.5, "curve": 2.0, "scale": 3.0, "cos": 4.0, "sin": 5.0, "omega": 6.0,
-        "coefficient": 7.0,
+        "coefficient": 7.0, "middle": 0.0,
     }  # fmt: skip
+    later = called({"cos(3.1*(t-12.5))": (4.0, 0.1), "sin(3.1*(t+1e+06))*u[n]": (5.0, 0.1)})
+    assert later == {"cos": (4.0, 0.1), "sin": (5.0, 0.1), "middle": (-1e6, 0.0)}
+    assert called({"cos(3.1*(t-12.5))": (4.0, 0.1)})["middle"] == (12.5, 0.0)
     assert called({"cos(u[n])": (1.0, 0.1)}) == {"coefficient": (1.0, 0.1)}
 
 

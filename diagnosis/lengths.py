@@ -1,0 +1,42 @@
+"""How long the pieces are that models are followed over, in rows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.border import MOST
+from latticebench.diagnosis.problem import Problem
+
+# Derivatives of the states of one piece by the numbers of its border, at most: they grow as the square of its length.
+MOST_MOVES = 5e6
+
+
+def least(problem: Problem) -> int:
+    """Return the fewest rows of a piece that say something."""
+    return 2 * problem.chain.order // problem.chain.levels + 2
+
+
+def longest(problem: Problem) -> int:
+    """Return the rows of the longest pieces: whole recordings, or some periods where the border has curves."""
+    whole, plain = max(len(one.t) for one in problem.data), problem.plain
+    if not len(plain.border):
+        return whole
+    period = 2 * np.pi / problem.main / problem.step
+    room = int(np.sqrt(MOST_MOVES / (MOST * len(plain.border) * plain.parts * plain.size)))
+    return min(whole, max(min(round(rules.BORDER * period), room), least(problem)))
+
+
+def longer(problem: Problem, length: int, settled: bool) -> list[int]:
+    """Return the rows of the pieces after those of `length`, and fewer in case these cannot be followed.
+
+    Args:
+        problem: the recordings.
+        length: rows of the pieces now.
+        settled: whether the last growth changed nothing: the next one is larger.
+    """
+    most = longest(problem)
+    if length >= most:
+        return []
+    further = [length * many for many in ((rules.FASTER, rules.GROWTH) if settled else (rules.GROWTH,))]
+    return list(dict.fromkeys(one if one < rules.ALMOST * most else most for one in further))
