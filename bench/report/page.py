@@ -6,6 +6,7 @@ The template escapes every text. Markup is only what SymPy and matplotlib write,
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from latticebench.systems.files import write_text
 
 if TYPE_CHECKING:
     import jinja2
+    import markupsafe
 
     from latticebench.bench.overlay import Overlay
 
@@ -80,7 +82,16 @@ def environment() -> jinja2.Environment:
     )  # fmt: skip
     found.filters["digits"] = lambda value, count: f"{value:.{count}g}"
     found.filters["markup"] = markupsafe.Markup
+    found.filters["typeset"] = _typeset
     return found
+
+
+def _typeset(text: str) -> markupsafe.Markup:
+    """Return a sentence as HTML: what stands between backticks as code, R^2 with its exponent raised."""
+    import markupsafe
+
+    whole = re.sub(r"`([^`]*)`", r"<code>\1</code>", str(markupsafe.escape(text)))
+    return markupsafe.Markup(re.sub(r"\bR\^2\b", "R<sup>2</sup>", whole))
 
 
 def _bars(report: Report) -> list[dict[str, Any]]:

@@ -185,6 +185,9 @@ def test_the_page_of_a_fit_says_first_whether_the_equation_fits(swings: Samples)
         assert quality.in_words.split(";")[0] in text
         assert "t in ms, readings in deg" in text
         assert ">t / ms<" in text
+        assert "R<sup>2</sup> = 0." in text or "R<sup>2</sup> = 1" in text or "R<sup>2</sup> &lt; -1" in text
+        assert ("<code>latticebench diagnose</code>" in text) is not fits
+        assert "`" not in text.split("<h2>")[0].split("</style>")[1]
 
 
 def test_pictures_are_what_their_ending_says_and_films_move(run: Run, swings: Samples, tmp_path: Path) -> None:
