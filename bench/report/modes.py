@@ -22,7 +22,7 @@ class Modes(Content):
 
     Attributes:
         recording: the peaks of the recording's spectrum, without decay rates.
-        before, after: modes of the declared equation and of the last model, for small swings.
+        before, after: modes of the declared equation and of the last model, for swings as large as the recording has.
     """
 
     recording: tuple[Mode, ...]
