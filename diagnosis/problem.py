@@ -197,8 +197,9 @@ class Problem:
         )
         scene = Scene(
             chain,
-            float(first.t[0]),
+            float(longest.t[0]),
             span,
+            (float(min(one.t[0] for one in data)), float(max(one.t[-1] for one in data))),
             top,
             _frequencies(top, span, step),
             past,

@@ -75,7 +75,8 @@ class Scene:
 
     Attributes:
         chain: the lattice.
-        begin, span: the first time, and the length of the longest recording.
+        begin, span: the first time of the longest recording, and its length.
+        seen: the first and the last time of all recordings.
         top: the highest angular frequency that the readings plainly show.
         frequencies: angular frequencies that an outside influence may have.
         past: the smoothed field of each recording as a function of times, (B,) -> (parts, B, N).
@@ -86,16 +87,12 @@ class Scene:
     chain: Chain
     begin: float
     span: float
+    seen: tuple[float, float]
     top: float
     frequencies: Float[ndarray, " frequencies"]
     past: tuple[Factor, ...]
     texts: tuple[str, ...]
     inputs: bool
-
-    @property
-    def seen(self) -> tuple[float, float]:
-        """The times from and to which something was read."""
-        return self.begin, self.begin + self.span
 
     @property
     def middle(self) -> float:

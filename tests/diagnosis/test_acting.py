@@ -205,6 +205,18 @@ def test_a_model_with_a_kick_is_fitted_only_where_its_middle_is_among_the_readin
         assert (found is not None) == fitted
 
 
+def test_of_several_recordings_kicks_are_sought_in_the_longest_and_may_be_in_any():
+    whole = recording(False)
+    short, early = (replace(whole, t=whole.t[:60] + 100, u=whole.u[:60], v=whole.v[:60], f=whole.f[:60]), whole)
+    problem = Problem.of(REAL[0], 2, [short, early], (find("kick"), find("drive")))
+    assert problem.scene.seen == (0.5, short.t[-1])
+    kicks = [one for one in problem.candidates if one.effect.name == "kick"]
+    assert min(one.at for one in kicks) == 0.5
+    assert max(one.at for one in kicks) < 12.5
+    assert kicks[0].moved([0.1, 103.0, 0.5]).possible
+    assert {one.middle for one in problem.candidates if one.effect.name == "drive"} == {6.5}
+
+
 # Words ----------------------------------------------------------------------------------------------------------------
 
 
