@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 from latticebench.methods.method import Fit, Method, Skipped, solve
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Library
+from latticebench.systems.options import option
 from latticebench.systems.samples import Samples
 from latticebench.systems.user_files import raised
 
@@ -42,7 +43,7 @@ def case_of(**given: Any) -> FitCase:
         return FitCase(**{"library": "", "label": "", "method": "", "memory_limit": 2**30, **given})
     except pydantic.ValidationError as error:
         first = error.errors()[0]
-        raise InputError(f"--{first['loc'][0]}: {first['msg'].lower()}, it is {first['input']!r}") from None
+        raise InputError(f"{option(str(first['loc'][0]))}: {first['msg'].lower()}, it is {first['input']!r}") from None
 
 
 def fit(data: Sequence[Samples], library: Library, order: int, method: Method, seed: int) -> Fit:

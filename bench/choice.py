@@ -14,6 +14,7 @@ from latticebench.bench.axes import read_seeds
 from latticebench.bench.case import Case, code_file
 from latticebench.bench.grid import Contestant
 from latticebench.systems.errors import InputError, unknown
+from latticebench.systems.options import option
 
 # What a pattern is compared with, besides the title of a case.
 NAMED = ("part", "system", "data", "library", "label", "effect", "effects", "instrument", "name")
@@ -72,7 +73,7 @@ class Choice:
             elif name in registered or name in brought:
                 found[name] = Contestant(method=name)
             else:
-                error = unknown("method", name, {*own, *registered, *brought}, "--methods")
+                error = unknown("method", name, {*own, *registered, *brought}, option("methods"))
                 raise InputError(f"{error} (or the path of a .py file)")
         return found
 
@@ -117,13 +118,13 @@ def chosen(
     """
     patterns = tuple(only or ())
     names = tuple(dict.fromkeys(name.strip() for text in given or () for name in text.split(",")))
-    for option, texts in (("--only", patterns), ("--methods", names)):
+    for name, texts in (("only", patterns), ("methods", names)):
         if not all(text.strip() and "\0" not in text for text in texts):
-            raise InputError(f"{option}: one of them is empty; leave it out")
+            raise InputError(f"{option(name)}: one of them is empty; leave it out")
     try:
         return Choice(patterns, names, () if seeds is None else tuple(dict.fromkeys(read_seeds(seeds))))
     except ValueError as error:
-        raise InputError(f"--seeds {seeds}: {error}") from None
+        raise InputError(f"{option('seeds', str(seeds))}: {error}") from None
 
 
 def _from(base: Path | None, path: str) -> str:

@@ -58,7 +58,10 @@ def pooled(forecasts: Sequence[Prediction]) -> float:
 
 
 def by_noise(forecasts: Sequence[Prediction], noise: Float[ndarray, " sensors"]) -> float:
-    """Return the error that forecasts would have if they were right but for the noise of the readings themselves.
+    """Return the error that forecasts would have if only the noise of the readings were left, as a share of these.
+
+    How far zeros wander is not counted, and sensors without a known noise are left out. Dimensionless; NaN where
+    nothing was read.
 
     Args:
         forecasts: of the held-out data.
@@ -66,9 +69,10 @@ def by_noise(forecasts: Sequence[Prediction], noise: Float[ndarray, " sensors"])
     """
     left, size = 0.0, 0.0
     for one in forecasts:
-        counted = np.sum(np.isfinite(one.seen), axis=(0, 1))
-        left += float(np.nansum(counted * noise[: len(counted)] ** 2))
-        size += float(np.nansum(one.seen**2))
+        variance = noise[: one.seen.shape[-1]] ** 2
+        known = np.where(np.isfinite(variance), one.seen, np.nan)
+        left += float(np.nansum(np.sum(np.isfinite(known), axis=(0, 1)) * variance))
+        size += float(np.nansum(known**2))
     return float(np.sqrt(left / size)) if size > 0 else float("nan")
 
 

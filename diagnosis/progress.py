@@ -14,8 +14,8 @@ class Tried:
     Attributes:
         name: of the effect.
         gain: its score, in nats.
-        price: what it has to gain: by its chance alone, beside others nearly like it that gain, too, and as a share of
-            what is left.
+        price: what it has to gain: what chance alone may gain, more where others nearly like it gain, too; or, if that
+            is larger, the share of a misfit that it has to take away.
     """
 
     name: str

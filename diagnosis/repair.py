@@ -110,7 +110,7 @@ class Diagnosis:
 
     @property
     def forecast_by_noise(self) -> float:
-        """What the noise of the held-out readings alone makes of that error."""
+        """That error if only the noise of the held-out readings were left."""
         return by_noise(self.forecasts[1], self.noise)
 
     @property

@@ -345,6 +345,7 @@ class Run:
         return f"<p>{html.escape(repr(self))}</p>{html_table(self.table())}"
 
 
+@called_from_python
 def run(
     suite: str | Path,
     *,

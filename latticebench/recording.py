@@ -175,9 +175,7 @@ def read(
     """
     chosen = (columns,) if isinstance(columns, str) else tuple(columns)
     if time is not None and not isinstance(time, str):
-        if not hasattr(source, "dtype") or is_labelled(source):
-            raise InputError("time: an array of times belongs to an array of readings; elsewhere it is a column's name")
-        source, time = (time, cast("ArrayLike", source)), None
+        source, time = _with_times(source, time), None
     layout = Layout(time, chosen, str(scale), sort, turn, str(time_scale))
     if is_labelled(source):
         table, layout = as_table(source, layout)
@@ -196,6 +194,21 @@ def read(
         raise InputError(f"{kind}: give an array with its times, lb.read(u, time=t), a table, or the name of a file")
     paths = [source] if isinstance(source, (str, Path)) else list(cast("Sequence[str | Path]", source))
     return Recording(tuple(read_all([Path(str(one)) for one in paths], "unknown", layout)))
+
+
+def _with_times(source: Any, time: ArrayLike) -> tuple[ArrayLike, ArrayLike]:
+    """Return times and readings as a pair.
+
+    Raises:
+        InputError: the readings are no array.
+    """
+    named = isinstance(source, (str, Path, pd.DataFrame, tuple)) or is_labelled(source)
+    if named or any(isinstance(one, (str, Path)) for one in source):
+        raise InputError(
+            "time: an array of times belongs to an array of readings, as in lb.read(u, time=t); elsewhere it is the "
+            "name of a column"
+        )
+    return time, source
 
 
 def _one_of(data: Recording, trajectory: int) -> Samples:

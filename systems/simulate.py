@@ -15,7 +15,6 @@ from latticebench.systems.arrays import empty, pieces, rows_of
 from latticebench.systems.errors import InputError
 from latticebench.systems.lattice import Integrator, System
 from latticebench.systems.motion import Motion, motion
-from latticebench.systems.options import option
 from latticebench.systems.samples import Samples, SimulatedSamples
 from latticebench.systems.stencil import Ends, evaluate
 from latticebench.systems.terms import Term, substitute
@@ -237,7 +236,7 @@ def _runge_kutta(
 def _unbounded(t: float) -> InputError:
     return InputError(
         f"the simulation fails near t = {t:g}: the state grows without bound; check parameters and initial state, "
-        f"or whether the integrator's step is too large ({option('integrator', 'dop853')})"
+        "or whether the integrator's step is too large: dop853 chooses its own"
     )
 
 

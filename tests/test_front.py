@@ -323,9 +323,36 @@ def test_readings_without_times_and_times_without_readings_are_refused_with_what
     u = np.zeros((4, 2))
     with pytest.raises(InputError, match=r"lb\.read\(u, time=t\)"):
         lb.read(u)
-    for source in (pd.DataFrame({"t": [0, 1], "u1": [0, 1]}), "u.csv"):
-        with pytest.raises(InputError, match="it is a column's name"):
+    table = pd.DataFrame({"t": [0, 1], "u1": [0, 1], "dtype": [0, 1]})
+    for source in (table, "u.csv", ["u.csv"], (np.arange(4), u)):
+        with pytest.raises(InputError, match="it is the name of a column"):
             lb.read(source, time=np.arange(4))
+    assert lb.read([[1, 2], [3, 4], [5, 6]], time=[0, 1, 2]).samples[0].sites == 2
+
+
+TIMES = np.arange(60) / 10
+WRONG_CALLS = {
+    "no times": lambda: lb.read(pd.DataFrame({"time_s": TIMES, "a_1_deg": TIMES})),
+    "no such column": lambda: lb.read(pd.DataFrame({"t": TIMES, "a": TIMES}), columns="b"),
+    "a column twice": lambda: lb.read(pd.DataFrame({"t": TIMES, "a": TIMES}), columns=["a", "a"]),
+    "no scale": lambda: lb.read(TIMES, time=TIMES, scale="furlong"),
+    "no time scale": lambda: lb.read(TIMES, time=TIMES, time_scale="moon"),
+    "no turn": lambda: lb.read(TIMES, time=TIMES, turn=-1),
+    "unsorted": lambda: lb.read(TIMES, time=TIMES[::-1]),
+    "no noise": lambda: lb.simulate("phi4", noise="x"),
+    "an empty pattern": lambda: lb.run("tiny", only=[""]),
+    "no method": lambda: lb.run("tiny", methods=["x"]),
+    "no seeds": lambda: lb.run("tiny", seeds="x"),
+    "a velocity of order 1": lambda: lb.fit(lb.read(TIMES, time=TIMES), lb.Model("v[n]", order=1, ends="free")),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_CALLS)
+def test_messages_in_python_name_arguments_not_options(wrong, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as refused:
+        WRONG_CALLS[wrong]()
+    assert "--" not in str(refused.value)
 
 
 def test_none_among_readings_is_a_missing_value():

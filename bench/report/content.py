@@ -68,7 +68,7 @@ class Errors(Content):
         residual: of the fit, in units of the noise.
         rms: of the fit, in the units of the readings.
         forecast: of held-out readings, relative.
-        forecast_by_noise: what the noise of these readings alone makes of it.
+        forecast_by_noise: the forecast error if only the noise of these readings were left, relative.
         coefficients: of the declared coefficients, relative; None where the truth is not known.
         criterion: the Bayesian information criterion less that of the declared equation.
         dynamics: the share of the derivative that the equation leaves.

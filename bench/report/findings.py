@@ -105,7 +105,7 @@ def _with_errors(one: Finding, function: Callable[[Placed], Mapping[str, float |
     for k, error in enumerate(errors):
         step = STEP * (error if error > 0 and np.isfinite(error) else max(abs(here[k]), STEP))
         moved = _floats(function(one.placed.moved(here + step * np.eye(len(here))[k])))
-        # A name may hold a number that has moved, as the time of a pulse.
+        # Labels contain numbers, such as the time of a pulse: after a step the same entry may have another name.
         there = dict(zip(found, moved.values(), strict=True)) if len(moved) == len(found) else moved
         for name, value in found.items():
             slopes[name][k] = (there[name] - value) / step if name in there else np.nan

@@ -91,8 +91,11 @@ def errors(report: Report) -> Table:
             return "-"
         return f"{100 * value:.3g} %" if value < DIVERGED else "diverges"
 
+    def nats(value: float) -> str:
+        # Over pieces of unlike lengths the two cannot be compared.
+        return "-" if math.isnan(report.error.criterion.after) else f"{value:.1f}"
+
     error, unit = report.error, report.recording.units.reading or "the units of the readings"
-    noise = "" if math.isnan(error.forecast_by_noise) else f" (noise alone: {share(error.forecast_by_noise)})"
     rows = [
         ["residual over the noise", *(f"{one:.3g}" for one in (error.residual.before, error.residual.after))],
         [
@@ -100,11 +103,10 @@ def errors(report: Report) -> Table:
             *(f"{one:.3g}" for one in (error.rms.before, error.rms.after)),
         ],
         ["share of the derivative that is left", share(error.dynamics.before), share(error.dynamics.after)],
-        [f"forecast error on held-out data{noise}", *map(share, (error.forecast.before, error.forecast.after))],
+        ["forecast error on held-out data", *map(share, (error.forecast.before, error.forecast.after))],
+        ["forecast error by noise alone", *map(share, (error.forecast_by_noise, error.forecast_by_noise))],
+        ["information criterion (lower is better)", *map(nats, (error.criterion.before, error.criterion.after))],
     ]
-    if not math.isnan(error.criterion.after):
-        both = error.criterion
-        rows.append(["information criterion (lower is better)", f"{both.before:.1f}", f"{both.after:.1f}"])
     if error.coefficients is not None:
         both = error.coefficients
         rows.append(["error of the declared coefficients", share(both.before), share(both.after)])
@@ -165,7 +167,9 @@ def tried(report: Report) -> list[Candidate]:
 def not_chosen(report: Report) -> list[str]:
     """Return why candidates whose gain is high were not taken."""
     shown, found = tried(report), []
-    if any(one.gain > one.price for one in shown):
+    if len(report.effects) >= rules.MOST_EFFECTS:
+        found.append(f"The model has {rules.MOST_EFFECTS} effects, the most that it may have: no more were fitted.")
+    elif any(one.gain > one.price for one in shown):
         found.append(
             "A gain is what the equation promises as far as it is linear. The best of those above their price were "
             "fitted in full, beside all that was found: none of these fits was better by its price."

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 DIGITS = 4
 # Numbers of effects that are times; what stands before a term that acts with a sign at every second site, or in time.
 TIMES = ("delay", "at", "width")
-IN_TIME = r"^(?:\(-1\)\^k|(?:cos|sin)\([^()]*\*(?:t|\(t[^()]*\))\)|exp\(-\(\(t-[^()]*\)/[^()]*\)\*\*2/2\))\*?"
+IN_TIME = r"^(?:\(-1\)\^k|(?:cos|sin)\([^()]*\*(?:t|\(t[^()]*\))\)|exp\(-\((?:t|\(t[^()]*\))/[^()]*\)\*\*2/2\))\*?"
 
 
 class Units(Content):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from latticebench.diagnosis import rules
-from latticebench.diagnosis.acting.placed import Chain, Force, InStep, Placed, Scene, Summand
+from latticebench.diagnosis.acting.placed import Chain, Force, InStep, Placed, Scene, Summand, decimal, since
 from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
 
@@ -45,15 +45,6 @@ class Wave(InStep):
         """Return it in the term language."""
         s = since(self.middle)
         return f"{f'{s}**{self.power}*' if self.power else ''}{self.name}({self.omega!r}*{s})"
-
-
-def since(middle: float) -> str:
-    """Return the time since another one, in the term language.
-
-    >>> since(0.0), since(12.5), since(-3.0)
-    ('t', '(t-12.5)', '(t+3)')
-    """
-    return f"(t{-middle:+.15g})" if middle else "t"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -133,7 +124,7 @@ class Harmonic(Placed, acts="harmonic"):
 
         t = sympy.Symbol("t", real=True)
         # Unevaluated, so that SymPy does not multiply the bracket out.
-        since_then = sympy.UnevaluatedExpr(t - sympy.Float(f"{self.middle:.15g}")) if self.middle else t
+        since_then = sympy.UnevaluatedExpr(t - decimal(self.middle)) if self.middle else t
         phase = sympy.Float(self.omega, 6) * since_then
         bodies = [wave(phase) * Term(text).in_decimals for wave in (sympy.cos, sympy.sin) for text in self.texts]
         return [Summand(*one) for one in zip(self.labels(chain), self.strength, bodies, strict=True)]

@@ -6,6 +6,7 @@ effect of the catalogue has in its field `acts`.
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -418,6 +419,23 @@ def times(value: float, text: str) -> str:
 def joined(summands: Iterable[str]) -> str:
     """Return a sum of what `times` returns, as text."""
     return " + ".join(summands).replace("+ -", "- ")
+
+
+def since(middle: float) -> str:
+    """Return the time since another one, in the term language.
+
+    >>> since(0.0), since(12.5), since(-3.0)
+    ('t', '(t-12.5)', '(t+3)')
+    """
+    return f"(t{-middle:+.15g})" if middle else "t"
+
+
+def decimal(value: float) -> sympy.Expr:
+    """Return a number as SymPy has it, with the digits that people are shown."""
+    import sympy
+
+    text = f"{value:.15g}"
+    return sympy.Integer(text) if re.fullmatch(r"-?\d+", text) else sympy.Float(text)
 
 
 def way_of(effect: Effect) -> type[Placed]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from latticebench.diagnosis import rules
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, InStep, Placed, Scene, Summand
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, InStep, Placed, Scene, Summand, decimal, since
 from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
 
@@ -75,13 +75,13 @@ class Pulse(Placed, acts="pulse"):
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the pulse of each term."""
-        shape = f"exp(-((t-{self._middle})/{abs(self.width):.6g})**2/2)"
+        shape = f"exp(-({since(self._middle)}/{abs(self.width):.6g})**2/2)"
         return tuple(shape if text == "1" else f"{shape}*{text}" for text in self.texts)
 
     @property
-    def _middle(self) -> str:
+    def _middle(self) -> float:
         """Its middle with as many digits as its width asks for, whatever the clock counts from."""
-        return f"{round(self.at, 3 - int(np.floor(np.log10(abs(self.width) + 1e-300)))):.15g}"
+        return round(self.at, 3 - int(np.floor(np.log10(abs(self.width) + 1e-300))))
 
     @property
     def near(self) -> tuple[object, ...]:
@@ -120,7 +120,7 @@ class Pulse(Placed, acts="pulse"):
         import sympy
 
         t = sympy.Symbol("t", real=True)
-        square = (t - sympy.Float(self._middle)) ** 2
+        square = (t - decimal(self._middle)) ** 2
         # Unevaluated, so that the numbers stand where a reader looks for them.
         below = sympy.Mul(2, sympy.Pow(sympy.Float(abs(self.width), DIGITS), 2, evaluate=False), evaluate=False)
         exponent = sympy.Mul(-1, square, sympy.Pow(below, -1, evaluate=False), evaluate=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,20 +60,68 @@ def test_the_modes_of_a_linear_chain_are_those_of_its_matrix():
     assert all(np.isnan(one.decay) for one in peaks)
 
 
-def test_the_modes_of_a_nonlinear_model_are_those_of_its_swing():
-    pendulum, drag, swing = library("pendulum", "sin(u[n]); u[n]**2*v[n]"), 0.05, 1.2
-    t = np.linspace(0, 30, 600)
-    run = solve_ivp(lambda t, y: [y[1], -np.sin(y[0]) - drag * y[0] ** 2 * y[1]], t[[0, -1]], [swing, 0.0], t_eval=t,
-                    rtol=1e-10, atol=1e-11)  # fmt: skip
-    u = run.y[:1].T + 1e-4 * np.random.default_rng(1).normal(size=(600, 1))
-    problem = Problem.of(pendulum, 2, [Samples(t, u, source="pendulum", ends="free")], ())
-    layout = Layout.of(problem, 600, None, 1e-5)
+def modes_of(terms, coefficients, recordings):
+    """The modes of a model that is fitted to exact motions, read with hardly any noise."""
+    own = library("own", terms)
+    noisy = [
+        replace(one, u=one.u + 1e-4 * np.random.default_rng(k).normal(size=one.u.shape))
+        for k, one in enumerate(recordings)
+    ]
+    problem = Problem.of(own, 1 if noisy[0].is_complex else 2, noisy, ())
+    layout = Layout.of(problem, max(len(one.t) for one in noisy), None, 1e-5)
     states = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
-    (mode,) = modes.of_model(fit(Model(pendulum, 2, (-1.0, -drag)), layout, states, structure=Structure()))
-    mean_square = 2 * np.mean(run.y[0] ** 2)
+    return modes.of_model(fit(Model(own, problem.order, coefficients), layout, states, structure=Structure()))
+
+
+def swung(rate, start, span, count, sites, ends="free"):
+    """A motion of some sites as a recording of positions, or of a complex field."""
+    t = np.linspace(0, span, count)
+    y = solve_ivp(rate, t[[0, -1]], start, t_eval=t, method="DOP853", rtol=1e-10, atol=1e-12).y.T
+    return Samples(t, y[:, :sites], source="swing", ends=ends)
+
+
+def pendulum(swing, span, count, drag=0.0):
+    return swung(lambda t, y: [y[1], -np.sin(y[0]) - drag * y[0] ** 2 * y[1]], [swing, 0.0], span, count, 1)
+
+
+def test_the_modes_of_a_nonlinear_model_are_those_of_its_swing():
+    drag, swing = 0.05, pendulum(1.2, 30, 600, drag=0.05)
+    (mode,) = modes_of("sin(u[n]); u[n]**2*v[n]", (-1.0, -drag), [swing])
+    mean_square = 2 * np.mean(swing.u**2)
     # A pendulum of amplitude A has the period 4 K(sin(A/2)); u^2 v takes the share A^2/8 of its amplitude per time.
     assert mode.frequency == pytest.approx(np.pi / 2 / ellipk(np.sin(np.sqrt(mean_square) / 2) ** 2), rel=0.005)
     assert mode.decay == pytest.approx(drag * mean_square / 8, rel=0.1)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.02])
+def test_forces_that_keep_the_energy_damp_nothing_however_short_the_recording_is(damping):
+    def rate(t, y):
+        u, v = np.split(y, 2)
+        beside = np.concatenate([u[1:], u[-1:]]) + np.concatenate([u[:1], u[:-1]])
+        return np.concatenate([v, 0.3 * (beside - 2 * u) - np.sin(u) - damping * v])
+
+    chain = swung(rate, [1.2, -0.4, 0.7, 0.2, 0, 0, 0, 0], 20, 400, 4)
+    terms, values = "u[n+1]+u[n-1]-2*u[n]; sin(u[n])", (0.3, -1.0)
+    terms, values = (terms + "; v[n]", (*values, -damping)) if damping else (terms, values)
+    found = modes_of(terms, values, [chain])
+    assert len(found) == 4
+    np.testing.assert_allclose([one.decay for one in found], damping / 2, rtol=0.05, atol=1e-9)
+
+    def turning(t, y):
+        beside = np.concatenate([y[1:], y[-1:]]) + np.concatenate([y[:1], y[:-1]])
+        return 1j * (0.5 * (beside - 2 * y) + np.abs(y) ** 2 * y)
+
+    light = swung(turning, np.array([1.0, 0.4j, -0.6]), 12, 300, 3)
+    kept = modes_of("i*(u[n+1]+u[n-1]-2*u[n]); i*abs(u[n])**2*u[n]", (0.5, 1.0), [light])
+    assert kept
+    assert [one.decay for one in kept] == [0.0] * len(kept)
+
+
+def test_the_modes_of_a_model_are_those_of_the_longest_of_several_recordings():
+    short, long = pendulum(0.2, 20, 200), pendulum(1.8, 40, 400)
+    (one,), (other,) = (modes_of("sin(u[n])", (-1.0,), both) for both in ([short, long], [long, short]))
+    assert one.frequency == pytest.approx(np.pi / 2 / ellipk(np.sin(0.9) ** 2), rel=0.01)
+    assert other.frequency == pytest.approx(one.frequency, rel=1e-3)
 
 
 def test_the_rest_of_a_recording_is_forecast_to_the_noise():
@@ -111,6 +160,9 @@ def test_a_right_forecast_is_as_wrong_as_the_noise_alone_makes_it():
     forecast = [Prediction(np.arange(2000.0), seen, right, 0.0)]
     assert pooled(forecast) == pytest.approx(by_noise(forecast, noise), rel=0.05)
     assert np.isnan(by_noise([], noise))
+    # A sensor without a known noise is left out.
+    (alone,) = (replace(one, seen=one.seen[..., :1], predicted=one.predicted[..., :1]) for one in forecast)
+    assert by_noise(forecast, np.array([0.1, np.nan])) == pytest.approx(by_noise([alone], noise))
 
 
 CATALOGUE = tuple(find(name) for name in ("quadratic-drag", "defect", "sensor-offset", "constant-force"))

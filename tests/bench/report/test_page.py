@@ -20,6 +20,7 @@ from latticebench.bench.report.document import Provenance, to_dict
 from latticebench.bench.report.page import page, write_page
 from latticebench.bench.report.whereabouts import spectrum
 from latticebench.diagnosis.repair import SMALL
+from latticebench.diagnosis.rules import MOST_EFFECTS
 from latticebench.systems.errors import InputError
 
 Made = Callable[..., Any]
@@ -105,6 +106,10 @@ def test_why_a_candidate_above_its_price_was_not_taken_is_said(pendula: Made) ->
     assert "fitted in full" in fitted
     assert fitted in html.unescape(page_of(pendula()))
     first, last = pendula().horizons
+    many = pendula().findings[:1] * MOST_EFFECTS
+    assert rows.not_chosen(content(pendula(findings=many))) == [
+        "The model has 8 effects, the most that it may have: no more were fitted."
+    ]
     below = tuple(replace(one, gain=one.price - 1) for one in last.tried)
     assert rows.not_chosen(content(pendula(horizons=(first, replace(last, tried=below))))) == []
     (share,) = rows.not_chosen(content(pendula(horizons=(first, replace(last, tried=below, misfit=True)))))
@@ -119,11 +124,17 @@ def test_a_forecast_that_runs_away_is_said_to_and_hides_no_readings(pendula: Mad
         for one in pendula().forecasts[0]
     ]
     away = pendula(forecasts=(far, pendula().forecasts[1]), forecast=(np.inf, 0.01))
-    assert ["forecast error on held-out data (noise alone: 0.8 %)", "diverges", "1 %"] in rows.errors(content(away))[1]
+    assert ["forecast error on held-out data", "diverges", "1 %"] in rows.errors(content(away))[1]
     assert to_dict(content(away))["error"]["forecast"]["before"] == "inf"
-    assert "information criterion" in page_of(away)
-    assert "information criterion" not in page_of(pendula(criterion=(0.0, np.nan)))
+    assert ["forecast error by noise alone", "0.8 %", "0.8 %"] in rows.errors(content(away))[1]
     assert "<svg" in page_of(away)
+
+
+def test_models_over_pieces_of_unlike_lengths_are_not_compared_by_a_criterion(pendula: Made) -> None:
+    (told,) = [row[1:] for row in rows.errors(content(pendula()))[1] if row[0].startswith("information")]
+    assert told == ["0.0", "-9000.0"]
+    (told,) = [row[1:] for row in rows.errors(content(pendula(criterion=(0.0, np.nan))))[1] if "criterion" in row[0]]
+    assert told == ["-", "-"]
 
 
 def test_a_long_record_makes_no_larger_figures() -> None:

@@ -66,6 +66,13 @@ def test_a_kick_whose_time_is_hardly_known_has_all_its_standard_errors(pendula: 
         assert effect.natural[name].stderr == pytest.approx(error)
 
 
+def test_a_kick_before_the_clock_began_is_said_without_two_signs(pendula: Made) -> None:
+    chain = pendula().after.chain
+    for at, label in ((-3.2, "exp(-((t+3.2)/0.5)**2/2)"), (0.0, "exp(-(t/0.5)**2/2)"), (1.7e9, "(t-1700000000)")):
+        kick = Pulse(effect=find("kick"), texts=("1",), at=at, width=0.5, strength=(30.0,))
+        assert label in kick.labels(chain)[0]
+
+
 def test_a_linear_force_is_said_as_a_change_of_the_frequency_too(pendula: Made) -> None:
     force = Everywhere(effect=find("onsite-linear"), texts=("u[n]",), strength=(-0.09,))
     one = SimpleNamespace(

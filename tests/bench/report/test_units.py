@@ -71,7 +71,9 @@ def test_a_coefficient_has_the_unit_of_the_derivative_over_that_of_its_term(
         ("v[n]", "1/s"), ("u[n] at site 3", "1/s^2"), ("(-1)^k*u[n]", "1/s^2"), ("cos(2.5*t)", "mm/s^2"),
         ("cos(2.5*(t-12.5))", "mm/s^2"),
         ("sin(2.5*t)*u[n]", "1/s^2"),
-        ("sin(2.5*(t+3))*u[n]", "1/s^2"), ("exp(-((t-3)/0.5)**2/2)", "mm/s^2"), ("omega", "rad/s"), ("delay", "s"),
+        ("sin(2.5*(t+3))*u[n]", "1/s^2"), ("exp(-((t-3)/0.5)**2/2)", "mm/s^2"),
+        ("exp(-((t+3.2)/0.5)**2/2)", "mm/s^2"), ("exp(-(t/0.5)**2/2)*u[n]", "1/s^2"),
+        ("omega", "rad/s"), ("delay", "s"),
         ("decay time", "s"), ("mass_ratio", ""), ("slowness of the clock", ""), ("u[n](t-0.3)", "1/s^2"),
     ],
 )  # fmt: skip
