@@ -37,9 +37,11 @@ def regressed(problem: Problem) -> tuple[tuple[float, ...], float]:
 
 
 def sustained(problem: Problem) -> list[Model]:
-    """Return the declared equation with forces from outside at lines of the spectrum, each model with one line more.
+    """Return the declared equation with forces from outside at lines of the spectrum.
 
-    A steady swing may be the chain's own or a force's. Where forces make the strongest lines, coefficients that take
+    There are models with the best line, the best two and the best three, and one with each other line alone. A steady
+    swing may be the chain's own or a force's: of two lines of a single site either may be the one or the other, and
+    only what is not linear, or decays, tells them apart. Where forces make the strongest lines, coefficients that take
     these for the chain's own are far from right, and no short way leads from them to those that are.
 
     Raises:
@@ -53,30 +55,34 @@ def sustained(problem: Problem) -> list[Model]:
     offered = [one.tuned(line) for line in lines for one in waves.values()]
     plain = Model(problem.declared, problem.order, (0.0,) * len(problem.declared.terms), tuple(offered))
     design, target = _carrying(problem, offered)
+    declared = np.arange(len(plain.coefficients))
     columns = [
         np.arange(block.start, block.start + len(one.strength))
         for one, block in zip(offered, plain.blocks, strict=True)
     ]
-    kept = np.arange(len(plain.coefficients))
-    chosen: list[int] = []
-    found: list[Model] = []
-    while len(chosen) < AT_ONCE:
-        taken = {offered[k].frequency for k in chosen}
-        done = np.linalg.qr(design[:, kept])[0]
-        left, more = (one - done @ (done.T @ one) for one in (target, design))
-        shares = {
-            k: _solved(more[:, columns[k]], left)[1] for k, one in enumerate(offered) if one.frequency not in taken
-        }
-        best = min(shares, key=lambda k: shares[k], default=None)
-        if best is None or shares[best] > 1 - rules.SHARE:
-            break
-        chosen.append(best)
-        kept = np.concatenate([kept, columns[best]])
-        numbers = plain.numbers
+
+    def with_lines(chosen: Sequence[int]) -> Model:
+        kept, numbers = np.concatenate([declared, *(columns[k] for k in chosen)]), plain.numbers
         numbers[kept] = _solved(design[:, kept], target)[0]
         model = plain.moved(numbers)
-        found.append(replace(model, effects=tuple(model.effects[k] for k in chosen)))
-    return found
+        return replace(model, effects=tuple(model.effects[k] for k in chosen))
+
+    def shares(chosen: Sequence[int]) -> dict[int, float]:
+        """Return what each further line would leave of what the chosen ones leave, the least of each frequency."""
+        done = np.linalg.qr(design[:, np.concatenate([declared, *(columns[k] for k in chosen)])])[0]
+        left, more = (one - done @ (done.T @ one) for one in (target, design))
+        best: dict[float | None, tuple[float, int]] = {offered[k].frequency: (0.0, -1) for k in chosen}
+        for k, one in enumerate(offered):
+            share = _solved(more[:, columns[k]], left)[1]
+            best[one.frequency] = min(best.get(one.frequency, (np.inf, -1)), (share, k))
+        return {k: share for share, k in sorted(best.values()) if k >= 0 and share <= 1 - rules.SHARE}
+
+    alone = list(shares([]))
+    chosen, found = alone[:1], [with_lines(alone[:1])] if alone else []
+    while chosen and len(chosen) < AT_ONCE and (more := shares(chosen)):
+        chosen.append(next(iter(more)))
+        found.append(with_lines(chosen))
+    return [*found, *(with_lines([k]) for k in alone[1:])]
 
 
 def _solved(design: Float[ndarray, "rows numbers"], target: Float[ndarray, " rows"]) -> tuple[ndarray, float]:

@@ -97,7 +97,7 @@ class Search:
             self.open = tuple(one for one in self.problem.candidates if (long if one.slow else late or not one.timed))
             before, fits = carried[0], list(carried[1:])
             if late and not opened:
-                begun = (self._begun(one, self.problem, fits[0].layout) for one in sustained(self.problem))
+                begun = (self._begun(one, self.problem, fits[0].layout) for one in self._sustained)
                 fits += [one for one in begun if one is not None]
             opened = late
             self.say(f"following pieces of {waves:.3g} periods")
@@ -140,6 +140,11 @@ class Search:
     def _declared(self) -> Model:
         """The declared equation, with the numbers that a regression gives it."""
         return Model(self.problem.declared, self.problem.order, regressed(self.problem)[0])
+
+    @functools.cached_property
+    def _sustained(self) -> list[Model]:
+        """The declared equation with forces from outside at lines of the spectrum."""
+        return sustained(self.problem)
 
     def _begun(self, model: Model, seen: Problem, layout: Layout, steps: int = FIRST) -> Fitted | None:
         """Return the first fit of a model, from smoothed readings as they are seen."""
@@ -324,6 +329,7 @@ class Search:
             found = None if other.key in pool else self.refit(other, fitted.layout, near, fitted, CHANGED)
             if found is not None:
                 yield found
+        yield from self._with_lines_exchanged(fitted, pool)
         if len(model.effects) < rules.MOST_EFFECTS:
             timed = ahead == np.inf or not model.effects
             start, likely = self._likely(fitted, timed)
@@ -360,6 +366,24 @@ class Search:
                     other = self.exchanged(fitted, [number], one.placed, hope)
                     if other is not None:
                         yield other
+
+    def _with_lines_exchanged(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
+        """Yield models of a driven site in which a force makes another line of the spectrum, and the site this one.
+
+        A single site that swings at two frequencies may have either as its own, as far as it is linear.
+        """
+        model = fitted.model
+        driven = [one for one in model.effects if one.frequency is not None]
+        if self.problem.chain.sites > 1 or not driven:
+            return
+        rest = tuple(one for one in model.effects if not one.timed)
+        hope = fitted.cost + fitted.dispersion * sum(map(Worth(self.problem, fitted).price_of, driven))
+        for line in self._sustained:
+            other = replace(line, effects=(*rest, *line.effects))
+            if len(line.effects) == 1 and line.key[0] not in model.key and other.key not in pool:
+                found = self.climbed(other, fitted, hope)
+                if found is not None:
+                    yield found
 
     def _rather(self, one: Scored, placed: Placed) -> bool:
         """Return whether a candidate is to be tried in the place of an effect."""

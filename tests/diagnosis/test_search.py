@@ -61,6 +61,23 @@ def test_a_strong_force_below_the_motions_own_frequency_is_named(driven):
     assert np.max(sizes[:2, 1]) < 0.02
 
 
+@pytest.mark.slow
+def test_the_own_swing_of_a_driven_pendulum_is_not_taken_for_a_forces():
+    """Fifteen swings of u'' = -440 sin u + 87 cos(9.1 t + 4), of 0.6 rad, read with an offset."""
+    t = np.linspace(0, 4.4, 500)
+    u = solve_ivp(
+        lambda t, y: [y[1], -440 * np.sin(y[0]) + 87 * np.cos(9.1 * t + 4)], t[[0, -1]], [0.5, -3.0], t_eval=t,
+        rtol=1e-10, atol=1e-12,
+    ).y[:1].T  # fmt: skip
+    read = u + 0.44 + 0.02 * np.random.default_rng(2).normal(size=u.shape)
+    found = diagnose(library("pendulum", "sin(u[n])"), 2, [Samples(t, read, source="pendulum", ends="free")], CATALOGUE)
+    assert found.verdict == "explained"
+    assert sorted(one.name for one in found.findings) == ["drive", "sensor-offset"]
+    (drive,) = [one for one in found.findings if one.name == "drive"]
+    assert drive.placed.frequency == pytest.approx(9.1, abs=0.02)
+    assert found.declared[1][0] == pytest.approx(-440, rel=0.01)
+
+
 @pytest.mark.parametrize("omega", [0.7, 3.0])
 def test_the_fastest_motion_of_a_spring_is_its_own_and_of_what_relaxes_its_rate(omega, driven):
     t = np.linspace(0, 40, 400)
