@@ -13,6 +13,7 @@ from latticebench.bench.case import NAME
 from latticebench.bench.escape import markdown
 from latticebench.bench.provenance import lines
 from latticebench.bench.publish import format_number, markdown_list, readable
+from latticebench.bench.report.units import with_unit
 from latticebench.systems.errors import InputError
 from latticebench.systems.files import write_text
 
@@ -120,11 +121,9 @@ def _recording(result: Mapping[str, Any]) -> list[str]:
         return [*text, f"{result['status']}: {result['reason']}", ""]
     text += [f"Verdict: **{report['verdict']}**, {result['seconds']:.0f} s. {report['sentence']}", ""]
     for effect in report["effects"]:
-        values = ", ".join(
-            f"{name} {format_number(value)}"
-            for name, value in [*effect["parameters"].items(), *effect["coefficients"].items()]
-            if value is not None
-        )
+        natural = effect["natural"]
+        where = [f"{name} {value}" for name, value in effect["parameters"].items() if name not in natural]
+        values = ", ".join([*where, *(f"{name} {_sized(size)}" for name, size in natural.items())])
         alike = f"; cannot be told from {', '.join(effect['indistinguishable'])}" if effect["indistinguishable"] else ""
         text.append(f"- {effect['effect']}: {values}{alike}")
     text += ["", *(f"Noise: {line}." for line in report["noise_lines"])]
@@ -142,6 +141,14 @@ def _recording(result: Mapping[str, Any]) -> list[str]:
     listed = ", ".join(f"{one['effect']} {one['gain']:.1f} ({one['price']:.1f})" for one in tried[:SHOWN])
     text += ["", f"Candidates beside the last model, with what they gain and what they cost (nats): {listed}."]
     return [*text, ""]
+
+
+def _sized(size: Mapping[str, Any]) -> str:
+    """Return a number with its standard error and its unit, as far as they are known."""
+    if size["value"] is None:
+        return "unknown"
+    error = "" if size["stderr"] is None else f" ± {size['stderr']:.2g}"
+    return with_unit(f"{size['value']:.4g}{error}", size["unit"])
 
 
 def _named(model: Mapping[str, Any]) -> str:

@@ -70,13 +70,20 @@ def test_what_a_suite_says_of_a_recording_is_text_in_its_page(tmp_path: Path) ->
     evil = "<script>x</script> [a](javascript:x) `"
     case = {"name": "one", "about": evil, "file": evil, "terms": "u[n]", "order": 2, "ends": evil, "rows": None}
     error = {name: {"before": "<b>", "after": 0.5} for name in ("residual", "rms", "forecast")}
-    effect = {"effect": evil, "parameters": {evil: evil}, "coefficients": {}, "indistinguishable": [evil]}
+    size = {"value": -1.1313, "stderr": 0.0269, "unit": evil}
+    effect = {
+        "effect": evil,
+        "parameters": {"site": evil, evil: 1.0},
+        "natural": {evil: size, "time": {**size, "unit": "s"}},
+    }
+    effect["indistinguishable"] = [evil]
     report = {"verdict": evil, "sentence": evil, "effects": [effect], "noise_lines": [evil], "error": error}
     report["horizons"] = []
     told = [
         {"case": case, "status": "ok", "reason": "", "report": report, "seconds": 1.0},
         {"case": case, "status": "failed", "reason": evil, "report": None, "seconds": None},
     ]
+    assert any("time -1.131 ± 0.027 s" in line for line in page_of(told[0]))
     for line in (line for one in told for line in page_of(one)):
         assert "<script" not in line
         assert "<b>" not in line
