@@ -44,7 +44,7 @@ def option(name: str, value: str | float | bool | None = None) -> str:
     if value is None or value is True:
         return f"--{name}"
     text = value if isinstance(value, str) else f"{value:.16g}"
-    return f"--{name} {text}" if re.fullmatch(r"[\w.+-]+", text) else f'--{name} "{text}"'
+    return f"--{name} {text}" if re.fullmatch(r"[\w.,+-]+", text) else f'--{name} "{text}"'
 
 
 def options(**given: str | float | bool) -> str:
