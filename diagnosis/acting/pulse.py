@@ -51,7 +51,7 @@ class Pulse(Placed, acts="pulse"):
     Attributes:
         texts: T, or T and i*T for a complex coefficient.
         at, width: in the unit of time.
-        seen: the times from and to which something was read.
+        seen: the first and the last time of all recordings, between which its middle is.
     """
 
     texts: tuple[str, ...]
@@ -98,7 +98,7 @@ class Pulse(Placed, acts="pulse"):
 
     @property
     def possible(self) -> bool:
-        """Whether its middle is among the readings: of a flank alone, strength, time and width are anything."""
+        """Whether its middle is between the first and the last time: a flank alone tells no strength, time or width."""
         return self.seen[0] <= self.at <= self.seen[1]
 
     def begun(self, t: float) -> bool:
