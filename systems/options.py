@@ -53,7 +53,15 @@ def options(**given: str | float | bool) -> str:
     >>> options(time="time_s", columns="theta_*_deg")
     '--time time_s --columns "theta_*_deg"'
     """
-    told = [option(name.replace("_", "-"), value) for name, value in given.items()]
+    return beside(*(option(name.replace("_", "-"), value) for name, value in given.items()))
+
+
+def beside(*told: str) -> str:
+    """Return options and settings that are given together.
+
+    >>> beside(option("method", "stlsq"), setting("differentiation", "spline"))
+    '--method stlsq --set differentiation=spline'
+    """
     return (", " if _IN_PYTHON.get() else " ").join(told)
 
 

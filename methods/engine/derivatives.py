@@ -20,7 +20,7 @@ from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.method import Abilities
 from latticebench.systems.arrays import pieces, rows_of
 from latticebench.systems.errors import InputError, unknown
-from latticebench.systems.options import option, setting
+from latticebench.systems.options import beside, option, setting
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -236,8 +236,8 @@ def _smoothing(x: ndarray, splines: BSplines, fields: Iterable[ndarray]) -> Call
         steps = np.diff(x)
         raise InputError(
             f"the longest of its steps in time is {np.max(steps) / np.min(steps):.0e} times the shortest, too much for "
-            f"a spline; cut the recording into trajectories, or fit it by {option('method', 'stlsq')} with "
-            f"{setting('differentiation', 'FiniteDifference')}"
+            f"a spline; cut the recording into trajectories, or fit it by "
+            f"{beside(option('method', 'stlsq'), setting('differentiation', 'FiniteDifference'))}"
         ) from None
     d = np.maximum(d, 0.0)
     power, outside = np.zeros(count), 0.0
