@@ -76,6 +76,24 @@ def by_noise(forecasts: Sequence[Prediction], noise: Float[ndarray, " sensors"])
     return float(np.sqrt(left / size)) if size > 0 else float("nan")
 
 
+def ahead(one: Sequence[Prediction], other: Sequence[Prediction], noise: Float[ndarray, " sensors"]) -> float:
+    """Return by how many nats one model forecasts better than another; minus infinity where it runs away.
+
+    Args:
+        one: the first model's forecasts.
+        other: the second's, of the same readings.
+        noise: standard deviation of each sensor, those of u first; what is left is taken for white noise of this size.
+    """
+    if not np.isfinite(pooled(one)):
+        return -np.inf
+    found = 0.0
+    for mine, its in zip(one, other, strict=True):
+        with np.errstate(all="ignore"):
+            more = (its.predicted - its.seen) ** 2 - (mine.predicted - mine.seen) ** 2
+            found += float(np.nansum(more / noise[: mine.seen.shape[-1]] ** 2)) / 2
+    return found
+
+
 def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) -> list[Prediction]:
     """Return forecasts.
 

@@ -84,6 +84,11 @@ class Model:
         texts = [text for one in self.effects for text in one.effect.texts(self.order, is_complex=False)]
         return any(read_term(text).jumps for text in (*self.declared.texts, *texts))
 
+    @property
+    def timed(self) -> bool:
+        """Whether there are influences with a frequency or a time of their own in it."""
+        return any(one.timed and one.wandering() is None for one in self.effects)
+
     def with_past(self, past: tuple[Factor, ...]) -> Model:
         """Return the same model, fed with another field at earlier times of each recording."""
         return replace(self, effects=tuple(one.with_past(past) for one in self.effects))

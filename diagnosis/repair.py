@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from latticebench.diagnosis import modes, rules
 from latticebench.diagnosis.finding import Compared, Finding, compared, findings
 from latticebench.diagnosis.fitting import Fitted
-from latticebench.diagnosis.forecast import Prediction, by_noise, pooled, predict
+from latticebench.diagnosis.forecast import Prediction, ahead, by_noise, pooled, predict
 from latticebench.diagnosis.horizon import unread
 from latticebench.diagnosis.inputs import in_words
 from latticebench.diagnosis.instrument import dead_sensors, describe, without
@@ -23,7 +23,7 @@ from latticebench.diagnosis.problem import Problem, derivative_share
 from latticebench.diagnosis.progress import Found, Horizon
 from latticebench.diagnosis.search import Search, Watcher
 from latticebench.diagnosis.unnamed import Left, without_name
-from latticebench.diagnosis.worth import lost
+from latticebench.diagnosis.worth import Worth, lost
 from latticebench.methods.engine.record import without_halves
 from latticebench.methods.method import check_fit
 from latticebench.systems.arrays import free_memory
@@ -290,6 +290,10 @@ def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Predi
     """Return the best model after exchanges, without effects that make the forecast worse."""
     search.say("trying what could stand in the place of each effect")
     best = compared(search, found.models[0])
+    plainer = _plainer(search.problem, best.fitted, found.models, foreseen)
+    if plainer is not None:
+        search.say("the forecast is better without influences that have a frequency or a time of their own")
+        best = compared(search, plainer)
     if not best.fitted.model.effects:
         return best
     before, now = (pooled(foreseen(one)) for one in (found.before, best.fitted))
@@ -302,6 +306,23 @@ def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Predi
             break
         best, now = better
     return best
+
+
+def _plainer(
+    problem: Problem, best: Fitted, rivals: Sequence[Fitted], foreseen: Callable[[Fitted], list[Prediction]]
+) -> Fitted | None:
+    """Return the best rival without influences of a frequency or a time of their own; None if it is not the better one.
+
+    It is where it forecasts better by more nats than it is behind, and leaves of the forecast little more than noise.
+    """
+    worth = Worth(problem, best)
+    plain = min((one for one in rivals if not one.model.timed), key=worth.value, default=None)
+    if plain is None or not best.model.timed:
+        return None
+    behind, noise = worth.value(plain) - worth.value(best), plain.noise.deviation()
+    if behind > rules.PLAINER or pooled(foreseen(plain)) > rules.BEYOND_NOISE * by_noise(foreseen(plain), noise):
+        return None
+    return plain if ahead(foreseen(plain), foreseen(best), noise) > behind else None
 
 
 def _with_one_less(

@@ -24,13 +24,14 @@ from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
 from latticebench.diagnosis.noise_estimate import estimate
 from latticebench.diagnosis.past import past_of, settled
+from latticebench.diagnosis.pool import Pool
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.progress import Found, Horizon, Tried
 from latticebench.diagnosis.regression import regressed, sustained
 from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.walk_estimate import won_by_walking
-from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, same, wald
+from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, wald
 
 Watcher = Callable[[str], None]
 
@@ -53,8 +54,6 @@ MOST_OF_IT = 0.9
 NEAR = 2.0
 # On so few sensors each has a size and a correlation of its own whether or not that is plain.
 FEW_SENSORS = 8
-
-Pool = dict[tuple[str, ...], Fitted]
 
 
 class Search:
@@ -279,37 +278,19 @@ class Search:
 
     def _level(self, fits: list[Fitted], before: Fitted) -> list[Fitted]:
         """Return the best models of a horizon, where the declared equation alone leads to `before`."""
-        pool: Pool = {}
-        self.worth = Worth(self.problem, min(fits, key=lambda one: one.cost))
-        for one in fits:
-            self._keep(pool, one)
+        pool = Pool(self.problem, fits)
+        self.worth = pool.worth
         opened: set[tuple[str, ...]] = set()
         # The declared equation is opened last, if it can be followed: one effect may do what several of a model do.
         last = [before] if before.longest == fits[0].longest else []
-        while todo := [one for one in (*self._leading(pool), *last) if one.model.key not in opened]:
+        while todo := [one for one in (*pool.leading(), *last) if one.model.key not in opened]:
             opened.add(todo[0].model.key)
-            leader = self._leading(pool)[0]
+            leader = pool.leading()[0]
             ahead = np.inf if todo[0] is leader else self.value(leader)
             for found in self._neighbours(todo[0], pool, ahead):
-                self._keep(pool, found)
-        return self._leading(pool)
-
-    def _keep(self, pool: Pool, one: Fitted) -> None:
-        key = one.model.key
-        if key not in pool or self.value(one) < self.value(pool[key]):
-            pool[key] = one
-            self.worth = Worth(self.problem, min(pool.values(), key=lambda kept: kept.cost))
-
-    def _leading(self, pool: Pool) -> list[Fitted]:
-        """Return the best models that differ in what they say of the readings."""
-        ranked = sorted(pool.values(), key=self.value)
-        found: list[Fitted] = []
-        for one in ranked:
-            if len(found) == rules.RIVALS:
-                break
-            if not any(same(one, other) for other in found):
-                found.append(one)
-        return found
+                pool.keep(found)
+                self.worth = pool.worth
+        return pool.leading()
 
     def _neighbours(self, fitted: Fitted, pool: Pool, ahead: float) -> Iterator[Fitted]:
         """Yield models with a doubtful effect less, and with one of the best candidates more.
@@ -319,14 +300,14 @@ class Search:
         here, own = self.value(fitted), Worth(self.problem, fitted)
         model = fitted.model
         for number in range(len(model.effects)):
-            if model.without(number).key not in pool and not self._sure(fitted, number):
+            if model.without(number) not in pool and not self._sure(fitted, number):
                 hope = fitted.cost + fitted.dispersion * own.price_of(model.effects[number])
                 found = self.without(fitted, number, hope)
                 if found is not None:
                     yield found
         yield from self._exchanged(fitted, pool)
         for other, near in images(self.problem, fitted):
-            found = None if other.key in pool else self.refit(other, fitted.layout, near, fitted, CHANGED)
+            found = None if other in pool else self.refit(other, fitted.layout, near, fitted, CHANGED)
             if found is not None:
                 yield found
         yield from self._with_lines_exchanged(fitted, pool)
@@ -336,7 +317,7 @@ class Search:
             for one in likely[: rules.TRIED]:
                 gain = rules.UNDERSTATED * one.gain / fitted.dispersion
                 hopeless = here - gain + own.price_of(one.placed) > ahead
-                if not hopeless and model.with_effect(one.placed).key not in pool:
+                if not hopeless and model.with_effect(one.placed) not in pool:
                     found = self.with_effect(start, one.placed)
                     if found is not None and Worth(self.problem, found).better(found, fitted):
                         yield found
@@ -360,7 +341,7 @@ class Search:
             found = [one for one in self.standing_in(fitted, number) if self._rather(one, placed)]
             for one in found[:2]:
                 model = fitted.model.without(number).with_effect(one.placed)
-                if model.key not in pool:
+                if model not in pool:
                     cheaper = self.problem.price_of(placed) - self.problem.price_of(one.placed)
                     hope = fitted.cost + fitted.dispersion * max(cheaper, 0.0)
                     other = self.exchanged(fitted, [number], one.placed, hope)
@@ -380,7 +361,7 @@ class Search:
         hope = fitted.cost + fitted.dispersion * sum(map(Worth(self.problem, fitted).price_of, driven))
         for line in self._sustained:
             other = replace(line, effects=(*rest, *line.effects))
-            if len(line.effects) == 1 and line.key[0] not in model.key and other.key not in pool:
+            if len(line.effects) == 1 and line.key[0] not in model.key and other not in pool:
                 found = self.climbed(other, fitted, hope)
                 if found is not None:
                     yield found

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from latticebench.diagnosis.repair import diagnose
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.lattice import library
+from latticebench.systems.readers import read
 from latticebench.systems.samples import Samples
 
+CARTS = Path(__file__).parents[3] / "shared" / "data" / "measured" / "carts.csv"
 OMEGA, FRICTION, SWING, NOISE = 3.0, 0.35, 1.0, 0.005
 STIFF, SOFT = 9.0, 3.0
 
@@ -63,3 +68,15 @@ def test_sensors_that_face_each_other_are_told_from_a_repulsion_whether_or_not_a
     names = [one.name for one in found.findings]
     assert sorted(names) == (["sensor-gain"] if "; u[n]" in terms else ["onsite-linear", "sensor-gain"])
     assert abs(found.declared[1][0] - SOFT) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CARTS.exists(), reason="carts.csv is not here")
+def test_carts_that_come_to_rest_are_damped_and_not_driven():
+    (readings,) = read(CARTS)
+    found = diagnose(library("two", "u[n+1]+u[n-1]-2*u[n]; u[n]"), 2, [replace(readings, ends="fixed")], CATALOGUE)
+    names = {one.name for one in found.findings}
+    assert {"sensor-gain", "quadratic-drag", "bond-damping"} <= names
+    assert not found.after.model.timed
+    # A modulated spring stands in for the drag on all readings, and forecasts worse.
+    assert found.forecast[1] < 0.51

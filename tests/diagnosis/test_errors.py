@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.stats
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 from latticebench.diagnosis import modes
 from latticebench.diagnosis.fitting import fit
-from latticebench.diagnosis.forecast import Prediction, by_noise, pooled, predict
+from latticebench.diagnosis.forecast import Prediction, ahead, by_noise, pooled, predict
 from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
@@ -150,6 +151,21 @@ def test_forecasts_are_pooled_by_their_squares_and_one_that_runs_away_is_infinit
     half[2:] = np.nan
     assert pooled([Prediction(t, half, seen + 0.1, 0.1)]) == pytest.approx(0.1)
     assert np.isnan(pooled([]))
+
+
+def test_a_forecast_is_ahead_of_another_by_the_logarithm_of_the_likelihood_ratio():
+    generator, noise = np.random.default_rng(4), np.array([0.1, 0.4, 9.0, 9.0])
+    seen = generator.normal(size=(50, 1, 2))
+    near, far = (seen + size * generator.normal(size=seen.shape) for size in (0.1, 0.3))
+    seen[3, 0, 1] = np.nan
+    near_log, far_log = (
+        np.nansum(scipy.stats.norm.logpdf(one[:, 0] - seen[:, 0], scale=noise[:2])) for one in (near, far)
+    )
+    one, other, lost = ([Prediction(np.arange(50.0), seen, one, 0.0)] for one in (near, far, np.full_like(far, np.inf)))
+    assert ahead(one, other, noise) == pytest.approx(near_log - far_log)
+    assert ahead(other, one, noise) == pytest.approx(far_log - near_log)
+    assert ahead(one, lost, noise) == np.inf
+    assert ahead(lost, one, noise) == ahead(lost, lost, noise) == -np.inf
 
 
 def test_a_right_forecast_is_as_wrong_as_the_noise_alone_makes_it():

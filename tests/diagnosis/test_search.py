@@ -78,6 +78,14 @@ def test_the_own_swing_of_a_driven_pendulum_is_not_taken_for_a_forces():
     assert found.declared[1][0] == pytest.approx(-440, rel=0.01)
 
 
+@pytest.mark.parametrize(("behind", "goes_along"), [(1e9, True), (0.0, False)])
+def test_the_best_model_without_a_force_goes_along_if_it_is_not_too_far_behind(behind, goes_along, driven, monkeypatch):
+    monkeypatch.setattr(rules, "PLAINER", behind)
+    horizons = Search(Problem.of(SPRING, 2, [driven], CATALOGUE), lambda _: None).horizons()
+    found = next(one for one in horizons if one.models[0].model.timed)
+    assert [one.model.timed for one in found.models] == [True] * rules.RIVALS + [False] * goes_along
+
+
 @pytest.mark.parametrize("omega", [0.7, 3.0])
 def test_the_fastest_motion_of_a_spring_is_its_own_and_of_what_relaxes_its_rate(omega, driven):
     t = np.linspace(0, 40, 400)

@@ -1,0 +1,54 @@
+"""The models of a horizon: what they are worth, and which of them lead."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.fitting import Fitted
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.problem import Problem
+from latticebench.diagnosis.worth import Worth, same
+
+
+class Pool:
+    """Fits of models on one horizon, of each model the best.
+
+    Attributes:
+        worth: what models are worth beside the fit of least cost.
+    """
+
+    def __init__(self, problem: Problem, fits: Iterable[Fitted]) -> None:
+        self.worth = Worth(problem)
+        self._kept: dict[tuple[str, ...], Fitted] = {}
+        for one in sorted(fits, key=lambda one: one.cost):
+            self.keep(one)
+
+    def __contains__(self, model: Model) -> bool:
+        return model.key in self._kept
+
+    def keep(self, one: Fitted) -> None:
+        """Add a fit, unless there is a better one of the same model."""
+        key = one.model.key
+        if key not in self._kept or self.worth.better(one, self._kept[key]):
+            self._kept[key] = one
+            self.worth = Worth(self.worth.problem, min(self._kept.values(), key=lambda kept: kept.cost))
+
+    def leading(self) -> list[Fitted]:
+        """Return the best models that differ in what they say of the readings.
+
+        Where all of these have influences with a frequency or a time of their own, the best one without comes last: on
+        short horizons such an influence stands in for what is missing, and on long ones the way back is far.
+        """
+        found: list[Fitted] = []
+        plain: Fitted | None = None
+        ranked = sorted(self._kept.values(), key=self.worth.value)
+        for one in ranked:
+            if plain is None and not one.model.timed:
+                plain = one
+            if len(found) < rules.RIVALS and not any(same(one, other) for other in found):
+                found.append(one)
+        if plain is not None and all(one.model.timed for one in found):
+            behind = self.worth.value(plain) - self.worth.value(found[0])
+            found += [plain] if behind < rules.PLAINER else []
+        return found
