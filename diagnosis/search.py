@@ -310,17 +310,30 @@ class Search:
             found = None if other in pool else self.refit(other, fitted.layout, near, fitted, CHANGED)
             if found is not None:
                 yield found
-        yield from self._with_lines_exchanged(fitted, pool)
         if len(model.effects) < rules.MOST_EFFECTS:
             timed = ahead == np.inf or not model.effects
             start, likely = self._likely(fitted, timed)
+            # A leader's force may swing as a single site would itself. Then little speaks for the true force alone.
+            bare = not model.effects and self.problem.chain.sites == 1 and pool.leading()[0].model.timed
             for one in likely[: rules.TRIED]:
                 gain = rules.UNDERSTATED * one.gain / fitted.dispersion
                 hopeless = here - gain + own.price_of(one.placed) > ahead
-                if not hopeless and model.with_effect(one.placed) not in pool:
+                if (bare or not hopeless) and model.with_effect(one.placed) not in pool:
                     found = self.with_effect(start, one.placed)
                     if found is not None and Worth(self.problem, found).better(found, fitted):
                         yield found
+                        yield from self._grown(found) if bare else ()
+
+    def _grown(self, fitted: Fitted) -> Iterator[Fitted]:
+        """Yield a model with the best candidate without a frequency or a time of its own more, and again."""
+        found: Fitted | None = fitted
+        while found is not None and len(found.model.effects) < rules.MOST_EFFECTS:
+            fitted = found
+            start, likely = self._likely(fitted, timed=False)
+            found = self.with_effect(start, likely[0].placed) if likely else None
+            if found is not None and not Worth(self.problem, found).better(found, fitted):
+                return
+            yield from [found] if found is not None else []
 
     def _likely(self, fitted: Fitted, timed: bool) -> tuple[Fitted, list[Scored]]:
         """Return the candidates whose score is above their price, and the fit that this is so for.
@@ -347,24 +360,6 @@ class Search:
                     other = self.exchanged(fitted, [number], one.placed, hope)
                     if other is not None:
                         yield other
-
-    def _with_lines_exchanged(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
-        """Yield models of a driven site in which a force makes another line of the spectrum, and the site this one.
-
-        A single site that swings at two frequencies may have either as its own, as far as it is linear.
-        """
-        model = fitted.model
-        driven = [one for one in model.effects if one.frequency is not None]
-        if self.problem.chain.sites > 1 or not driven:
-            return
-        rest = tuple(one for one in model.effects if not one.timed)
-        hope = fitted.cost + fitted.dispersion * sum(map(Worth(self.problem, fitted).price_of, driven))
-        for line in self._sustained:
-            other = replace(line, effects=(*rest, *line.effects))
-            if len(line.effects) == 1 and line.key[0] not in model.key and other not in pool:
-                found = self.climbed(other, fitted, hope)
-                if found is not None:
-                    yield found
 
     def _rather(self, one: Scored, placed: Placed) -> bool:
         """Return whether a candidate is to be tried in the place of an effect."""
