@@ -77,7 +77,9 @@ def by_noise(forecasts: Sequence[Prediction], noise: Float[ndarray, " sensors"])
 
 
 def ahead(one: Sequence[Prediction], other: Sequence[Prediction], noise: Float[ndarray, " sensors"]) -> float:
-    """Return by how many nats one model forecasts better than another; minus infinity where it runs away.
+    """Return by how many nats one model forecasts better than another.
+
+    It is minus infinity where the first runs away, else infinity where the second does.
 
     Args:
         one: the first model's forecasts.
@@ -86,10 +88,12 @@ def ahead(one: Sequence[Prediction], other: Sequence[Prediction], noise: Float[n
     """
     if not np.isfinite(pooled(one)):
         return -np.inf
+    if not np.isfinite(pooled(other)):
+        return np.inf
     found = 0.0
     for mine, its in zip(one, other, strict=True):
-        with np.errstate(all="ignore"):
-            more = (its.predicted - its.seen) ** 2 - (mine.predicted - mine.seen) ** 2
+        more = (its.predicted - its.seen) ** 2 - (mine.predicted - mine.seen) ** 2
+        with np.errstate(divide="ignore", invalid="ignore"):
             found += float(np.nansum(more / noise[: mine.seen.shape[-1]] ** 2)) / 2
     return found
 

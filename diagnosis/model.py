@@ -74,6 +74,11 @@ class Model:
         return tuple(sorted(repr((one.near, one.turns)) for one in self.effects))
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The names of its effects."""
+        return tuple(one.effect.name for one in self.effects)
+
+    @property
     def possible(self) -> bool:
         """Whether all effects have numbers such as they may have."""
         return all(one.possible for one in self.effects)
@@ -85,9 +90,14 @@ class Model:
         return any(read_term(text).jumps for text in (*self.declared.texts, *texts))
 
     @property
-    def timed(self) -> bool:
-        """Whether there are influences with a frequency or a time of their own in it."""
+    def may_stand_in(self) -> bool:
+        """Whether there is something with a frequency, a time or a delay of its own in it, wandering zeros apart."""
         return any(one.timed and one.wandering() is None for one in self.effects)
+
+    @property
+    def driven(self) -> bool:
+        """Whether there is something with a frequency of its own in it."""
+        return any(one.frequency is not None for one in self.effects)
 
     def with_past(self, past: tuple[Factor, ...]) -> Model:
         """Return the same model, fed with another field at earlier times of each recording."""

@@ -27,6 +27,10 @@ class Pool:
     def __contains__(self, model: Model) -> bool:
         return model.key in self._kept
 
+    def find(self, model: Model) -> Fitted | None:
+        """Return the fit of a model, or None."""
+        return self._kept.get(model.key)
+
     def keep(self, one: Fitted) -> None:
         """Add a fit, unless there is a better one of the same model."""
         key = one.model.key
@@ -37,18 +41,17 @@ class Pool:
     def leading(self) -> list[Fitted]:
         """Return the best models that differ in what they say of the readings.
 
-        Where all of these have influences with a frequency or a time of their own, the best one without comes last: on
-        short horizons such an influence stands in for what is missing, and on long ones the way back is far.
+        Where all of these may stand in for something else, by a frequency, a time or a delay of their own, the best one
+        that may not goes along: on short horizons it takes several effects to do what one such influence does.
         """
         found: list[Fitted] = []
         plain: Fitted | None = None
-        ranked = sorted(self._kept.values(), key=self.worth.value)
-        for one in ranked:
-            if plain is None and not one.model.timed:
+        for one in sorted(self._kept.values(), key=self.worth.value):
+            if plain is None and not one.model.may_stand_in:
                 plain = one
             if len(found) < rules.RIVALS and not any(same(one, other) for other in found):
                 found.append(one)
-        if plain is not None and all(one.model.timed for one in found):
+        if plain is not None and all(one.model.may_stand_in for one in found):
             behind = self.worth.value(plain) - self.worth.value(found[0])
-            found += [plain] if behind < rules.PLAINER else []
-        return found
+            found += [plain] if behind <= rules.PLAINER else []
+        return sorted(found, key=self.worth.value)

@@ -23,7 +23,7 @@ from latticebench.diagnosis.problem import Problem, derivative_share
 from latticebench.diagnosis.progress import Found, Horizon
 from latticebench.diagnosis.search import Search, Watcher
 from latticebench.diagnosis.unnamed import Left, without_name
-from latticebench.diagnosis.worth import Worth, lost
+from latticebench.diagnosis.worth import Worth, lost, misfits
 from latticebench.methods.engine.record import without_halves
 from latticebench.methods.method import check_fit
 from latticebench.systems.arrays import free_memory
@@ -190,6 +190,7 @@ def diagnose(
             if found is None:
                 raise InputError(f"{shown[0].source}: the declared equation cannot be followed even over a few samples")
             best = _named(search, found, foreseen)
+            found = _decided(search, found, best.fitted)
             search.say("looking for what has no name")
             left = without_name(search, best.fitted)
         except KeyboardInterrupt:
@@ -290,10 +291,8 @@ def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Predi
     """Return the best model after exchanges, without effects that make the forecast worse."""
     search.say("trying what could stand in the place of each effect")
     best = compared(search, found.models[0])
-    plainer = _plainer(search.problem, best.fitted, found.models, foreseen)
-    if plainer is not None:
-        search.say("the forecast is better without influences that have a frequency or a time of their own")
-        best = compared(search, plainer)
+    plainer = _plainer(search, best.fitted, found.models, foreseen)
+    best = best if plainer is None else plainer
     if not best.fitted.model.effects:
         return best
     before, now = (pooled(foreseen(one)) for one in (found.before, best.fitted))
@@ -309,20 +308,38 @@ def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Predi
 
 
 def _plainer(
-    problem: Problem, best: Fitted, rivals: Sequence[Fitted], foreseen: Callable[[Fitted], list[Prediction]]
-) -> Fitted | None:
-    """Return the best rival without influences of a frequency or a time of their own; None if it is not the better one.
+    search: Search, best: Fitted, rivals: Sequence[Fitted], foreseen: Callable[[Fitted], list[Prediction]]
+) -> Compared | None:
+    """Return the best rival without influences that may stand in for something else; None if it is not the better one.
 
     It is where it forecasts better by more nats than it is behind, and leaves of the forecast little more than noise.
     """
-    worth = Worth(problem, best)
-    plain = min((one for one in rivals if not one.model.timed), key=worth.value, default=None)
-    if plain is None or not best.model.timed:
+    worth = Worth(search.problem, best)
+    plain = min((one for one in rivals if not one.model.may_stand_in), key=worth.value, default=None)
+    if plain is None or not best.model.may_stand_in:
         return None
-    behind, noise = worth.value(plain) - worth.value(best), plain.noise.deviation()
+    behind, noise = worth.value(plain) - worth.value(best), np.maximum(plain.rms, search.problem.finest)
     if behind > rules.PLAINER or pooled(foreseen(plain)) > rules.BEYOND_NOISE * by_noise(foreseen(plain), noise):
         return None
-    return plain if ahead(foreseen(plain), foreseen(best), noise) > behind else None
+    if ahead(foreseen(plain), foreseen(best), noise) / best.dispersion <= behind:
+        return None
+    search.say("the forecast is better without influences that have a frequency or a time of their own")
+    found = compared(search, plain)
+    if found.fitted.model.may_stand_in:
+        search.worth = worth
+        return None
+    return found
+
+
+def _decided(search: Search, found: Found, best: Fitted) -> Found:
+    """Return how far the search came, with an entry of its own where a model was named that the readings put behind."""
+    leader, last = found.models[0], found.horizons[-1]
+    if best.model.may_stand_in or not leader.model.may_stand_in:
+        return found
+    search.screened(best)
+    models = ((best.model.names, 0.0), (leader.model.names, search.value(leader) - search.value(best)))
+    tried, misfit = search.tried[best.model.key], misfits(search.problem, best)
+    return replace(found, horizons=(*found.horizons, replace(last, models=models, tried=tried, misfit=misfit)))
 
 
 def _with_one_less(

@@ -28,8 +28,9 @@ STRETCHES = 32
 SLOWER = 10.0
 # Models that are carried to the next horizon.
 RIVALS = 3
-# Where all of these have influences with a frequency or a time of their own, the best model without any goes with them
-# if it is at most so many nats behind. It is named if it forecasts better by more nats than it is behind.
+# Where all of these have influences with a frequency, a time or a delay of their own, the best model without goes with
+# them if it is at most so many nats behind. It is named if it forecasts better by more nats than it is behind (as if
+# forecasts left white noise) and leaves of them at most BEYOND_NOISE times the noise.
 PLAINER = 30.0
 # Candidates of each model that are fitted in full, those of the highest score first.
 TRIED = 4

@@ -102,7 +102,7 @@ class Search:
             self.say(f"following pieces of {waves:.3g} periods")
             best = self._level(fits, before)
             base = self.value(best[0])
-            models = tuple((_names(one.model), self.value(one) - base) for one in best)
+            models = tuple((one.model.names, self.value(one) - base) for one in best)
             tried, misfit = self.tried.get(best[0].model.key, ()), misfits(self.problem, best[0])
             done = (*done, Horizon(best[0].longest, waves, models, tried, misfit))
             settled = last is not None and last.models[0].model.key == best[0].model.key
@@ -314,26 +314,34 @@ class Search:
             timed = ahead == np.inf or not model.effects
             start, likely = self._likely(fitted, timed)
             # A leader's force may swing as a single site would itself. Then little speaks for the true force alone.
-            bare = not model.effects and self.problem.chain.sites == 1 and pool.leading()[0].model.timed
+            bare = not model.effects and self.problem.chain.sites == 1 and pool.leading()[0].model.driven
             for one in likely[: rules.TRIED]:
                 gain = rules.UNDERSTATED * one.gain / fitted.dispersion
-                hopeless = here - gain + own.price_of(one.placed) > ahead
-                if (bare or not hopeless) and model.with_effect(one.placed) not in pool:
+                force = bare and one.placed.frequency is not None
+                hopeless = here - gain + own.price_of(one.placed) > ahead and not force
+                found = pool.find(model.with_effect(one.placed))
+                if found is None and not hopeless:
                     found = self.with_effect(start, one.placed)
-                    if found is not None and Worth(self.problem, found).better(found, fitted):
-                        yield found
-                        yield from self._grown(found) if bare else ()
+                    if found is None or not Worth(self.problem, found).better(found, fitted):
+                        continue
+                    yield found
+                if found is not None and force:
+                    yield from self._grown(found, pool)
 
-    def _grown(self, fitted: Fitted) -> Iterator[Fitted]:
-        """Yield a model with the best candidate without a frequency or a time of its own more, and again."""
-        found: Fitted | None = fitted
-        while found is not None and len(found.model.effects) < rules.MOST_EFFECTS:
-            fitted = found
+    def _grown(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
+        """Yield a model with the best candidate more, and again; nothing with a frequency or a time of its own."""
+        while len(fitted.model.effects) < rules.MOST_EFFECTS:
+            asked = dict(self.tried)
             start, likely = self._likely(fitted, timed=False)
-            found = self.with_effect(start, likely[0].placed) if likely else None
-            if found is not None and not Worth(self.problem, found).better(found, fitted):
+            # What a model was asked when it was opened is more than this.
+            self.tried |= asked
+            if not likely:
                 return
-            yield from [found] if found is not None else []
+            found = pool.find(fitted.model.with_effect(likely[0].placed)) or self.with_effect(start, likely[0].placed)
+            if found is None or not Worth(self.problem, found).better(found, fitted):
+                return
+            yield found
+            fitted = found
 
     def _likely(self, fitted: Fitted, timed: bool) -> tuple[Fitted, list[Scored]]:
         """Return the candidates whose score is above their price, and the fit that this is so for.
@@ -470,7 +478,3 @@ class Search:
                 best[key] = (one.gain - price, one)
         self.tried[fitted.model.key] = tuple(sorted(tried.values(), key=lambda one: one.price - one.gain))
         return [one for _, one in sorted(best.values(), key=lambda pair: -pair[0])]
-
-
-def _names(model: Model) -> tuple[str, ...]:
-    return tuple(one.effect.name for one in model.effects)

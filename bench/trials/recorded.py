@@ -135,7 +135,8 @@ def _recording(result: Mapping[str, Any]) -> list[str]:
     text += ["", "How the search went: the best model on each horizon, and how far the next one was behind (nats):", ""]
     for one in report["horizons"]:
         best, *others = one["models"]
-        behind = f"; {_named(others[0])} {others[0]['behind']:.1f} behind" if others else ""
+        far = others[0]["behind"] if others else 0.0
+        behind = f"; {_named(others[0])} {abs(far):.1f} {'ahead' if far < 0 else 'behind'}" if others else ""
         text.append(f"- {one['samples']} samples, {one['periods']:.2g} periods: {_named(best)}{behind}")
     tried = report["horizons"][-1]["tried"] if report["horizons"] else []
     listed = ", ".join(f"{one['effect']} {one['gain']:.1f} ({one['price']:.1f})" for one in tried[:SHOWN])

@@ -77,6 +77,11 @@ def test_carts_that_come_to_rest_are_damped_and_not_driven():
     found = diagnose(library("two", "u[n+1]+u[n-1]-2*u[n]; u[n]"), 2, [replace(readings, ends="fixed")], CATALOGUE)
     names = {one.name for one in found.findings}
     assert {"sensor-gain", "quadratic-drag", "bond-damping"} <= names
-    assert not found.after.model.timed
+    assert not found.after.model.may_stand_in
     # A modulated spring stands in for the drag on all readings, and forecasts worse.
     assert found.forecast[1] < 0.51
+    (_, none), (others, ahead) = found.horizons[-1].models
+    assert none == 0
+    assert "parametric-drive" in others
+    assert ahead < 0
+    assert any(one.name == "parametric-drive" for one in found.horizons[-1].tried)

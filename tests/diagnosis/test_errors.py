@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import scipy.stats
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
-from latticebench.diagnosis import modes
+from latticebench.diagnosis import modes, repair
 from latticebench.diagnosis.fitting import fit
 from latticebench.diagnosis.forecast import Prediction, ahead, by_noise, pooled, predict
 from latticebench.diagnosis.horizon import Layout
@@ -165,7 +166,38 @@ def test_a_forecast_is_ahead_of_another_by_the_logarithm_of_the_likelihood_ratio
     assert ahead(one, other, noise) == pytest.approx(near_log - far_log)
     assert ahead(other, one, noise) == pytest.approx(far_log - near_log)
     assert ahead(one, lost, noise) == np.inf
+    # What cannot be fitted to the early readings has all later ones; a forecast has some.
+    long = [Prediction(np.arange(80.0), np.ones((80, 1, 2)), np.full((80, 1, 2), np.nan), np.inf)]
+    assert ahead(one, long, noise) == np.inf
     assert ahead(lost, one, noise) == ahead(lost, lost, noise) == -np.inf
+
+
+@pytest.mark.parametrize(
+    ("behind", "wrong", "other", "named"),
+    [
+        (10.0, 1.0, 1.5, True), (40.0, 1.0, 1.5, False), (10.0, 1.0, 1.05, False), (10.0, 2.5, 9.0, False),
+        (10.0, 1.0, np.inf, True), (10.0, np.inf, np.inf, False),
+    ],
+)  # fmt: skip
+def test_a_model_without_a_force_is_named_if_it_forecasts_better_by_more_than_it_is_behind(
+    behind, wrong, other, named, monkeypatch
+):
+    """Of 50 readings with noise 1, the forecasts are wrong by so much each."""
+    plain, driven = (
+        SimpleNamespace(model=SimpleNamespace(may_stand_in=it), rms=np.ones(1), dispersion=1.0) for it in (False, True)
+    )
+    seen = 10 * np.ones((50, 1, 1))
+    forecasts = {
+        id(one): [Prediction(np.arange(50.0), seen, seen + size, size)]
+        for one, size in ((plain, wrong), (driven, other))
+    }
+    monkeypatch.setattr(repair, "Worth", lambda *_: SimpleNamespace(value=lambda one: behind if one is plain else 0.0))
+    monkeypatch.setattr(repair, "compared", lambda _, fitted: SimpleNamespace(fitted=fitted))
+    search = SimpleNamespace(problem=SimpleNamespace(finest=0.0), say=lambda _: None)
+    found = repair._plainer(search, driven, [driven, plain], lambda one: forecasts[id(one)])
+    assert (found is not None and found.fitted is plain) == named
+    assert repair._plainer(search, plain, [driven, plain], lambda one: forecasts[id(one)]) is None
+    assert repair._plainer(search, driven, [driven], lambda one: forecasts[id(one)]) is None
 
 
 def test_a_right_forecast_is_as_wrong_as_the_noise_alone_makes_it():

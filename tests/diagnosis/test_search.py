@@ -82,8 +82,9 @@ def test_the_own_swing_of_a_driven_pendulum_is_not_taken_for_a_forces():
 def test_the_best_model_without_a_force_goes_along_if_it_is_not_too_far_behind(behind, goes_along, driven, monkeypatch):
     monkeypatch.setattr(rules, "PLAINER", behind)
     horizons = Search(Problem.of(SPRING, 2, [driven], CATALOGUE), lambda _: None).horizons()
-    found = next(one for one in horizons if one.models[0].model.timed)
-    assert [one.model.timed for one in found.models] == [True] * rules.RIVALS + [False] * goes_along
+    found = next(one for one in horizons if one.models[0].model.may_stand_in)
+    assert [one.model.may_stand_in for one in found.models] == [True] * rules.RIVALS + [False] * goes_along
+    assert np.all(np.diff([behind for _, behind in found.horizons[-1].models]) >= 0)
 
 
 @pytest.mark.parametrize("omega", [0.7, 3.0])
