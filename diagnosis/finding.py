@@ -120,7 +120,12 @@ def _rivals(search: Search, fitted: Fitted, without: Fitted | None, number: int,
             yield found
     if without is None:
         return
-    for one in search.screened(without, timed=placed.timed):
+    scored = search.screened(without, timed=placed.timed)
+    if placed.timed:
+        # A score is linear, and far below what a strong effect brings: its own is to be compared with.
+        own = [one.gain / fitted.dispersion for one in scored if one.placed.effect.name == placed.effect.name]
+        evidence = min([evidence, *own])
+    for one in scored:
         name = one.placed.effect.name
         enough = one.gain / fitted.dispersion > COMPARABLE * evidence
         if name not in names and enough and len(names) < MOST_ALTERNATIVES and one.placed.place != placed.place:

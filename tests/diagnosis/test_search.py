@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench import systems
+from latticebench.bench.trials.laboratory.making import make_recording
 from latticebench.bench.trials.trial import Trial
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.problem import Problem
@@ -107,3 +108,11 @@ def test_other_ends_than_those_declared_are_found_in_a_chain_that_relaxes():
     found = diagnose(system.library("equation"), 1, [samples], CATALOGUE)
     assert [one.name for one in found.findings] == ["ends"]
     assert found.verdict == "explained"
+
+
+@pytest.mark.slow
+def test_a_force_that_does_as_well_as_a_modulation_is_named_beside_it():
+    """By its score alone the force comes to a third of what the modulation brings when it is fitted."""
+    recording = make_recording(90035, effects=("drive", "sensor-offset"), sites=1)
+    found = diagnose(recording.declared, recording.order, [recording.samples], CATALOGUE)
+    assert [one for one in found.findings if "drive" in (one.name, *one.alternatives)]
