@@ -122,9 +122,9 @@ def _rivals(search: Search, fitted: Fitted, without: Fitted | None, number: int,
         return
     scored = search.screened(without, timed=placed.timed)
     if placed.timed:
-        # A score is linear, and far below what a strong effect brings: its own is to be compared with.
+        # A score is linear, and far below what a strong effect brings: the effect's own score is its measure.
         own = [one.gain / fitted.dispersion for one in scored if one.placed.effect.name == placed.effect.name]
-        evidence = min([evidence, *own])
+        evidence = min(evidence, max(own, default=evidence))
     for one in scored:
         name = one.placed.effect.name
         enough = one.gain / fitted.dispersion > COMPARABLE * evidence
