@@ -115,7 +115,7 @@ def share(text: str, digits: int = 0) -> str:
 
 def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings_say() -> None:
     exact = []
-    for folder in ("laboratory", "laboratory-later"):
+    for folder in ("laboratory", "laboratory-later", "laboratory-third"):
         summary = pd.read_csv(RESULTS / "loop" / folder / "summary.csv", comment="#", dtype=str)
         every = summary[summary["by"] == "all"].iloc[0]
         for column in ("right", "residual at most 1.3", "intervals that hold", "forecast worse"):
@@ -124,8 +124,8 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     classic = pd.read_csv(RESULTS / "loop" / "classic" / "summary.csv", comment="#", dtype=str)
     assert f"among two or three effects | {NAMED} | {share(classic['right'].iloc[0])} |" in words("diagnosis")
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
-    first, later = (f"{one.split(' (')[0]} of {one.split()[-1]}" for one in exact)
-    assert f"in {first} and {later} laboratory recordings" in readme
+    first, later, third = (f"{one.split(' (')[0]} of {one.split()[-1]}" for one in exact)
+    assert f"in {first}, {later} and {third} laboratory recordings" in readme
 
 
 def test_the_page_on_the_diagnosis_says_what_the_second_look_at_held_out_instruments_found() -> None:
