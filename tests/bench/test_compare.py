@@ -77,6 +77,14 @@ def test_a_method_is_better_only_where_enough_pairs_say_so() -> None:
     assert list(compare(old, old).methods["p"]) == [1.0, 1.0]
 
 
+@pytest.mark.parametrize("status", ["failed", "memory", "timeout", "died"])
+def test_a_method_that_no_longer_comes_to_an_end_is_worse_whatever_ended_it(status: str) -> None:
+    old = fits(*(("a", seed, 0.1 + seed / 100) for seed in range(12)))
+    new = fits(*(("a", seed, None, status) for seed in range(12)))
+    told = compare(old, new).methods.iloc[0]
+    assert (told["verdict"], told["pairs"]) == ("worse", 12)
+
+
 HEAD = "# command: latticebench run loop\nsystem,effect,z,noise,velocities,seed,status,right,residual_after\n"
 
 
@@ -135,6 +143,12 @@ def test_what_is_no_published_table_is_one_clear_line(tmp_path: Path, text: str)
         read_run(tmp_path / "some.csv")
     with pytest.raises(InputError, match="no results"):
         read_run(tmp_path / "none")
+
+
+def test_of_a_table_that_lacks_columns_the_first_one_is_named(tmp_path: Path) -> None:
+    (tmp_path / "some.csv").write_text("effect,z\n1,2\n")
+    with pytest.raises(InputError, match="the column 'system' is missing"):
+        read_run(tmp_path / "some.csv")
 
 
 LABORATORY = "# command: latticebench run laboratory\nasked,seed,status,right,residual_after\n"

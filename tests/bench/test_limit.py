@@ -184,6 +184,25 @@ def test_the_bound_with_a_measured_input_is_the_one_from_finite_differences():
     assert found.noise == pytest.approx(0.01 / np.std(u))
 
 
+def test_between_samples_that_are_far_apart_the_bound_follows_the_motion():
+    t = np.arange(0, 40, 2.5)
+
+    def motion(p):
+        return solve_ivp(
+            lambda at, y: [y[1], p[0] * y[0] + p[1] * y[0] ** 3], (0, t[-1]), p[2:], t_eval=t, rtol=1e-11, atol=1e-13
+        ).y
+
+    true = np.array([-2.0, -0.5, 1.0, 0.0])
+    slopes = np.stack([(motion(true + h)[0] - motion(true - h)[0]) / 2e-5 for h in 1e-5 * np.eye(4)], axis=1)
+    expected = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))[:2] * 0.01
+    u, v = motion(true)
+    exact = Samples(t, u[:, None], v[:, None], ends="free")
+    found = bound_along(
+        [replace(exact, v=None)], [exact], library("oscillator", "u[n]; u[n]**3"), 2, true[:2], noise=white(0.01)
+    )
+    np.testing.assert_allclose(found.stderr, expected, rtol=1e-4)
+
+
 def test_the_bound_of_a_fit_stands_for_measured_samples():
     samples, _ = oscillator(0.01)
     terms = library("oscillator", "u[n]; v[n]; f[n]")

@@ -180,3 +180,11 @@ def test_the_key_of_a_case_does_not_depend_on_its_label_or_limits(tmp_path: Path
     same = case.model_copy(update={"label": "another", "time_limit": 5.0})
     other = case.model_copy(update={"seed": 77})
     assert key_of(same, suite) == key_of(case, suite) != key_of(other, suite)
+
+
+@pytest.mark.parametrize("lacking", ["title", "roots", "blank", "run"])
+def test_a_kind_of_case_that_lacks_a_part_cannot_be_made(lacking: str) -> None:
+    parts = {name: getattr(FitCase, name) for name in ("title", "roots", "blank", "run") if name != lacking}
+    kind = type("Incomplete", (Case,), {"__module__": __name__, **parts})
+    with pytest.raises(TypeError, match=lacking):
+        kind(kind="incomplete")

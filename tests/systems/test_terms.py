@@ -116,6 +116,14 @@ def test_reach_and_sites_are_those_of_the_text():
     assert Term("u[n-1]").reach == (1, 0)
 
 
+def test_of_all_terms_dry_friction_alone_jumps():
+    assert Term("sign(v[n])").jumps
+    assert Term(" sign( v[n] ) ").jumps
+    assert not any(
+        Term(text).jumps for text in ("abs(v[n])*v[n]", "sign(u[n])", "f[n]", "u[n]", "v[n]", "2*sign(v[n])")
+    )
+
+
 def test_split_reads_terms_in_their_order_and_keeps_their_texts():
     assert [term.text for term in split(" u[n+1];u[n]**3 ; ;sin( u[n] )")] == ["u[n+1]", "u[n]**3", "sin( u[n] )"]
 
