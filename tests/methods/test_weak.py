@@ -295,3 +295,19 @@ def test_where_the_noise_explains_what_is_left_the_first_start_is_enough(monkeyp
     chosen, truth, order = candidates("phi4", "lib2")
     fit = make(Weak, {}).fit([seen("phi4", 0.01)], chosen, order, 0)
     assert judge(fit, truth)[0] < 0.02
+
+
+def test_a_site_whose_readings_are_lost_tells_nothing_though_its_input_was_read() -> None:
+    t = np.linspace(0, 20, 201)
+    f = np.cos(np.outer(t, [1.3, 1.7, 2.1]))
+    # u'' = -4 u + f, its own swing and the forced one.
+    u = f / (4 - np.array([1.3, 1.7, 2.1]) ** 2) + np.sin(2 * t)[:, None]
+    rng = np.random.default_rng(3)
+    u += 1e-3 * rng.normal(size=u.shape)
+    lost = u.copy()
+    lost[3:, 1] = np.nan
+    terms = library("forced", "u[n]; f[n]")
+    found = make(Weak, {}).fit([Samples(t, lost, f=f, ends="free")], terms, 2, 0)
+    without = make(Weak, {}).fit([Samples(t, u[:, [0, 2]], f=f[:, [0, 2]], ends="free")], terms, 2, 0)
+    np.testing.assert_allclose(found.coefficients, without.coefficients, rtol=1e-6)
+    np.testing.assert_allclose(found.coefficients, [-4, 1], rtol=0.01)

@@ -76,3 +76,12 @@ def test_a_window_is_never_narrower_than_a_few_samples() -> None:
     t = np.linspace(0, 8, 161)
     narrow = fit(Samples(t, np.cos(2 * t)[:, None], ends="free"), "u[n]", 2, widths=(1e-6,), finer=(1,))
     np.testing.assert_allclose(narrow.coefficients, [-4], rtol=0.05)
+
+
+def test_what_the_narrowest_window_is_does_not_depend_on_the_unit_of_time() -> None:
+    t = np.linspace(0, 8, 161)
+    seconds, years = (
+        fit(Samples(t * unit, np.cos(2 * t)[:, None], ends="free"), "u[n]", 2, widths=(1e-6,), finer=(1,))
+        for unit in (1.0, 2.0**-25)
+    )
+    np.testing.assert_allclose(seconds.coefficients, years.coefficients * 2.0**-50, rtol=1e-6)

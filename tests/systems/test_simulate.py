@@ -181,6 +181,13 @@ def test_a_state_that_grows_without_bound_is_told(method):
         simulate(own("5*u[n]**3", 1, initial=("2", "0")), integrator=method)
 
 
+@pytest.mark.parametrize("method", ["bdf", "dop853"])
+def test_where_no_step_is_small_enough_the_motion_is_told_to_end(method):
+    # u' = -1/u from 1 is sqrt(1 - 2 t), which ends at t = 1/2.
+    with pytest.raises(InputError, match=r"fails near t = 0\.4375"):
+        simulate(own("-1/u[n]", 1, initial=("1", "0")), integrator=method, times=sample_times(8, 3.5))
+
+
 def test_a_chain_that_breaks_off_is_followed_as_far_as_it_goes():
     # u' = u^2 from 1 is 1/(1 - t), which ends at t = 1.
     chain = motion(own("u[n]**2", 1), {}, 3)

@@ -116,6 +116,20 @@ def test_reach_and_sites_are_those_of_the_text():
     assert Term("u[n-1]").reach == (1, 0)
 
 
+@pytest.mark.parametrize(
+    ("text", "degrees"),
+    [
+        ("u[n]", (1, 0, 0)), ("2", (0, 0, 0)), ("u[n]*v[n]**2", (1, 2, 0)), ("u[n+1]+u[n-1]-2*u[n]", (1, 0, 0)),
+        ("abs(v[n])*v[n]", (0, 2, 0)), ("sign(v[n])", (0, 0, 0)), ("abs(u[n])**0.5*f[n]", (0.5, 0, 1)),
+        ("(u[n+1]-u[n])**3", (3, 0, 0)), ("u[n]/f[n]", (1, 0, -1)), ("-u[n]**2", (2, 0, 0)),
+        ("sin(u[n])", None), ("u[n]+u[n]**3", None), ("u[n]+v[n]", None), ("exp(f[n])", None), ("u[n]-u[n]", None),
+    ],
+)  # fmt: skip
+def test_the_degrees_of_a_term_are_the_powers_with_which_it_grows(text, degrees):
+    found = Term(text).degrees
+    assert found == (degrees if degrees is None else pytest.approx(degrees))
+
+
 def test_of_all_terms_dry_friction_alone_jumps():
     assert Term("sign(v[n])").jumps
     assert Term(" sign( v[n] ) ").jumps
