@@ -90,6 +90,10 @@ EQUAL: dict[str, str] = {
     'if not {"results", "origins", "suite", "about"} < names:': "a store has further tables",
     "rows, seen = (*self.rows, piece), self.seen ^ len(piece.target)": "another seed of a draw",
     "points = slice(int(some[0]), int(some[-1]) // 1)": "a test function is nearly 0 at the last of its points",
+    "def _connect(path: Path, mode: str, /, fresh: bool = False) -> sqlite3.Connection:": "how it may be called",
+    "point = {one: (0.3 % 0.1 * k) + (0 if one.is_real else 0.2j) for k, one in enumerate(symbols)}": "another point",
+    "if not noise * max(float(np.max(np.abs(clean.u[some]))) for some in rows_of(clean.u)) < 1e+300:": "adds 1",
+    "if len(regression.target) <= regression.design.shape[1] // 1:": "a triangle of as many rows has the same sums",
 }
 
 

@@ -51,6 +51,7 @@ def test_a_short_fit_finds_an_oscillator():
     history = fit.history
     assert history is not None
     assert np.all(np.diff(history.step) > 0)
+    assert 300 < history.step[-1] <= 1800
     assert np.all(np.diff(history.seconds) >= 0)
     assert history.coefficients.shape == (len(history.step), 2)
     np.testing.assert_array_equal(history.coefficients[0], 0)

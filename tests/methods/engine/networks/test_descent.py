@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.methods.engine.networks.descent import lockstep
+from latticebench.methods.engine.networks.descent import _first_length, lockstep
 
 
 @pytest.mark.parametrize("package", ["numpy", "torch"])
@@ -41,3 +41,11 @@ def test_a_member_at_rest_or_before_a_wall_does_not_hold_the_others_up():
     assert np.array_equal(end[0], [0, 0])
     assert 2 <= end[1, 0] < 2.1
     np.testing.assert_allclose(end[2], [0, 0], atol=1e-6)
+
+
+def test_the_first_step_downhill_moves_no_farther_than_one():
+    slopes = np.array([-4.0, -1.21, -0.5, 0.0])
+    length = _first_length(slopes, np)
+    np.testing.assert_allclose(length, [1 / 2, 1 / 1.1, 1, 1])
+    # A slope of -|g|^2 is that of a step along -g.
+    assert np.all(length * np.sqrt(-slopes) <= 1 + 1e-12)
