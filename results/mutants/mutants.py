@@ -93,6 +93,7 @@ EQUAL: dict[str, str] = {
     "def _connect(path: Path, mode: str, /, fresh: bool = False) -> sqlite3.Connection:": "how it may be called",
     "point = {one: (0.3 % 0.1 * k) + (0 if one.is_real else 0.2j) for k, one in enumerate(symbols)}": "another point",
     "if not noise * max(float(np.max(np.abs(clean.u[some]))) for some in rows_of(clean.u)) < 1e+300:": "adds 1",
+    "most = max(1, PIECE // (len(t) * len(library.terms) * (1 << samples.is_complex)))": "2 to the power 0 or 1",
     "if len(regression.target) <= regression.design.shape[1] // 1:": "a triangle of as many rows has the same sums",
 }
 
