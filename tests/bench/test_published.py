@@ -128,6 +128,15 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     assert f"in {first}, {later} and {third} laboratory recordings" in readme
 
 
+def test_the_page_on_the_diagnosis_says_how_long_laboratory_recordings_take() -> None:
+    frame = pd.read_csv(RESULTS / "loop" / "laboratory-third" / "laboratory.csv", comment="#")
+    long, others = (frame.loc[which, "cpu_seconds"] for which in (frame["sites"] == 24, frame["sites"] < 24))
+    assert f"`results/loop/laboratory-third` took {long.min():.0f} to {long.max():.0f} seconds" in words("diagnosis")
+    assert f"Of its other {len(others)} recordings half took less than 8 seconds, a third more" in words("diagnosis")
+    assert 7 < others.median() < 8
+    assert (others > 15).mean() == pytest.approx(1 / 3, abs=0.03)
+
+
 def test_the_page_on_the_diagnosis_says_what_the_second_look_at_held_out_instruments_found() -> None:
     frame = pd.read_csv(RESULTS / "loop" / "second-look" / "laboratory.csv", comment="#")
     alarms = nothing_missing(frame).set_index("instrument")["false alarms"]
