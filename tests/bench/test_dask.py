@@ -339,8 +339,9 @@ def test_workers_that_are_killed_at_random_moments_lose_nothing_and_make_nothing
 def test_workers_that_start_too_slowly_for_dask_are_replaced(tmp_path: Path) -> None:
     suite = suite_of(tmp_path / "s", {"good": ""}, seeds="[1, 2, 3]")
     before = {one.pid for one in psutil.Process().children()}
-    # Dask gives a worker up that is not back by then: 15 s, which a busy machine may need.
-    with dask.config.set({"distributed.deploy.lost-worker-timeout": "10ms"}), Place(local=1).connected() as connection:
+    # Dask gives a worker up that is not back by then: 15 s, which a busy machine may need. Set after the connection has
+    # imported distributed: a setting made before would take all of distributed's own with it when it ends.
+    with Place(local=1).connected() as connection, dask.config.set({"distributed.deploy.lost-worker-timeout": "10ms"}):
         for one in psutil.Process().children():
             if one.pid not in before and "spawn_main" in " ".join(one.cmdline()):
                 one.kill()
