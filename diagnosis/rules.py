@@ -70,6 +70,9 @@ SHARE, SHARE_TIMED = 0.1, 0.5
 # Nats that a chain costs in which neighbours push each other away. In a linear chain of two it is the mirror image of
 # one whose second sensor looks from the other side; of the two, that is what laboratories have.
 REPELLING = 30.0
+# A motion that is farther from its zero than the readings are from theirs, by d times its swing, costs so many times
+# ln(1 + d^2) nats: Cauchy's prior for where the zero is. A curved scale that is looked at from afar is another gain.
+DISPLACED = 1.0
 # A forecast is worse where its error grows by more than this share of itself and is more than so many times the noise:
 # with fewer readings every number more costs a little.
 WORSE, BEYOND_NOISE = 0.05, 2.0

@@ -84,6 +84,25 @@ def repelling(problem: Problem, model: Model) -> float:
     return rules.REPELLING if any(text == COUPLING and value < 0 for text, value in pairs) else 0.0
 
 
+@functools.lru_cache(maxsize=64)
+def displaced(fitted: Fitted) -> float:
+    """Return the nats that a motion costs which is farther from its zero than its readings are from theirs.
+
+    It is ln(1 + d^2), with d the difference between the two distances of the mean, each in units of its own swing. By a
+    constant force and offsets that make it good, a sensor's curve passes for a gain: it is looked at from afar.
+    """
+    curves = fitted.curves()
+    moving = list(fitted.chain.moving)
+    read = np.concatenate([one.level[:, 0][..., moving] for one in curves])
+    there = np.concatenate([one.field[:, 0][..., moving] for one in curves])
+    distance = []
+    for one in (there, read):
+        mean, swing = np.nanmean(one, axis=0), np.nanstd(one, axis=0)
+        distance.append(float(np.sqrt(np.mean(mean**2) / max(float(np.mean(swing**2)), 1e-300))))
+    farther = max(distance[0] - distance[1], 0.0)
+    return rules.DISPLACED * float(np.log1p(farther**2))
+
+
 def wald(fitted: Fitted, number: int) -> float:
     """Return the nats that an effect brings as far as the model is linear: half of Wald's statistic.
 
@@ -145,7 +164,7 @@ class Worth:
         effects = zip(fitted.model.effects, crowdings(self.problem, fitted), strict=True)
         misfit = 1.0 if self.best is None else self.best.dispersion
         prices = sum(self.price_of(one) * max(1.0, many / misfit) for one, many in effects)
-        return prices + float(noise) + repelling(self.problem, fitted.model)
+        return prices + float(noise) + repelling(self.problem, fitted.model) + displaced(fitted)
 
     def value(self, fitted: Fitted) -> float:
         """Return the cost of a fit, as much less as the best one misfits, and its price, in nats."""

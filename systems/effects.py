@@ -33,7 +33,7 @@ HOW: dict[str, str] = {
     "drift": "the reading is u + d (t - t_0) / T, T being the recording's length; at one site, which is found",
     "wander": "the reading is u + w(t), w wandering at random, more slowly than the sites swing; at one site, found",
     "gain": "the reading is g u; at one site, which is found, or with a g for every site",
-    "curve": "the reading is u + c u^2",
+    "curve": "the reading is u + c u^2, with one c for all sensors or at one of them",
     "clock": "the recorded times are wrong by a share of themselves",
 }
 """The ways of acting, each with what it does; `latticebench.diagnosis.acting` has one class for each."""

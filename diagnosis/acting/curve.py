@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, Placed, Scene
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, OfSensors, Placed, Scene
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
@@ -16,36 +16,40 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Curve(Placed, acts="curve"):
-    """The reading is u + c u^2, or u + c |u| u for a complex field, at every site.
+class Curve(OfSensors, acts="curve"):
+    """The reading is u + c u^2, or u + c |u| u for a complex field, at all sites with one c, or at one of several.
 
     Attributes:
         both: whether the velocity is that of the bent reading, too.
     """
 
     both: bool
-    instrument: ClassVar[bool] = True
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return all sensors, without and with velocities."""
-        if effect.texts(scene.chain.order, scene.chain.is_complex):
-            for both in (False, True)[: scene.chain.levels]:
-                yield cls(effect=effect, both=both, strength=(0.0,))
+        """Return all sensors alike, and every one of several, without and with velocities."""
+        chain = scene.chain
+        if not effect.texts(chain.order, chain.is_complex):
+            return
+        every = tuple(range(chain.sites))
+        for both in (False, True)[: chain.levels]:
+            for sites in [every, *((site,) for site in every if chain.sites > 1)]:
+                yield cls(effect=effect, sites=sites, both=both, strength=(0.0,))
 
     @property
     def place(self) -> tuple[object, ...]:
-        """The effect, and whether velocities are concerned."""
-        return (self.effect.name, self.both)
+        """The effect, the sites, and whether velocities are concerned."""
+        return (self.effect.name, self.sites, self.both)
 
-    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
+    def labels(self, chain: Chain) -> tuple[str, ...]:
         """Return the columns that are bent."""
-        return ("curve of u" + (" and v" if self.both else ""),)
+        which = "" if len(self.sites) == chain.sites else str(self.sites[0] + 1)
+        return (f"curve of u{which}" + (f" and v{which}" if self.both else ""),)
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
         """Return what the bend adds."""
         by, slope = np.zeros((1, *field.shape)), np.zeros_like(field)
-        u = field[:, 0]
+        u, here = field[:, 0], np.isin(np.arange(field.shape[-1]), self.sites)
         if u.shape[1] == 1:
             by[0, :, 0] = u**2
             slope[:, 0] = 2 * self.strength[0] * u
@@ -56,6 +60,7 @@ class Curve(Placed, acts="curve"):
             size = np.hypot(u[:, 0], u[:, 1])[:, None]
             by[0, :, 0] = size * u
             slope[:, 0] = self.strength[0] * (size + u**2 / np.where(size > 0, size, 1.0))
+        by, slope = by * here, slope * here
         return Misreading(np.tensordot(self.strength, by, 1), slope, by)
 
     def sentences(self, chain: Chain) -> list[str]:

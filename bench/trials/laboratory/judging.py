@@ -1,7 +1,7 @@
 """How a diagnosis of a laboratory recording is judged: what it names, against what is in it.
 
 Each effect must be named, alone or in a group of effects that the diagnosis says it cannot tell apart, by a finding of
-its own; what is found beyond that is invented. Several offsets, or gains, of different sensors are one effect.
+its own; what is found beyond that is invented. Several offsets, gains, or curves, of different sensors are one effect.
 
 Intervals are those of the model that is named. Gains are relative: where another sensor gives the unit of u than in the
 truth, true values are said in that unit. Where a force is named that does the same as the true one, or is at another
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from latticebench.diagnosis.repair import Diagnosis
 
 # Effects of which one may be found at several sensors.
-ONE_FOR_ALL = ("sensor-offset", "sensor-gain")
+ONE_FOR_ALL = ("sensor-offset", "sensor-gain", "sensor-curve")
 # What an instrument of a kind does by itself: a finding says so, or the noise model holds it.
 OF_INSTRUMENT = {"drifting-zero": ("sensor-drift", "sensor-wander")}
 # The power of the unit of u by which the parameters of effects grow, where it is not 0.
@@ -82,7 +82,7 @@ def called(values: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
     """
     found = {}
     for label, (value, error) in values.items():
-        sensor, wave = re.match(r"(offset|gain) of u(\d+)", label), re.match(WAVE, label)
+        sensor, wave = re.match(r"(offset|gain|curve) of u(\d+)", label), re.match(WAVE, label)
         if sensor is not None:
             found[f"{sensor[1]}_{sensor[2]}"] = (value + (sensor[1] == "gain"), error)
         elif wave is not None:

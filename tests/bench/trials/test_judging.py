@@ -140,13 +140,13 @@ def test_where_a_force_does_the_work_of_another_the_sizes_of_forces_are_not_comp
 
 def test_values_have_the_names_that_recordings_have_for_them() -> None:
     labels = {
-        "offset of u1": 1.0, "gain of u12": 0.5, "curve of u": 2.0, "scale": 3.0, "cos(3.14159*t)": 4.0,
-        "sin(3.14159*t)": 5.0, "omega": 6.0, "-v[n]": 7.0,
+        "offset of u1": 1.0, "gain of u12": 0.5, "curve of u": 2.0, "curve of u3": 8.0, "scale": 3.0,
+        "cos(3.14159*t)": 4.0, "sin(3.14159*t)": 5.0, "omega": 6.0, "-v[n]": 7.0,
     }  # fmt: skip
     found = called({label: (value, 0.1) for label, value in labels.items()})
     assert {name: value for name, (value, _) in found.items()} == {
-        "offset_1": 1.0, "gain_12": 1.5, "curve": 2.0, "scale": 3.0, "cos": 4.0, "sin": 5.0, "omega": 6.0,
-        "coefficient": 7.0, "middle": 0.0,
+        "offset_1": 1.0, "gain_12": 1.5, "curve": 2.0, "curve_3": 8.0, "scale": 3.0, "cos": 4.0, "sin": 5.0,
+        "omega": 6.0, "coefficient": 7.0, "middle": 0.0,
     }  # fmt: skip
     later = called({"cos(3.1*(t-12.5))": (4.0, 0.1), "sin(3.1*(t+1e+06))*u[n]": (5.0, 0.1)})
     assert later == {"cos": (4.0, 0.1), "sin": (5.0, 0.1), "middle": (-1e6, 0.0)}
