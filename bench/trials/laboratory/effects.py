@@ -1,8 +1,8 @@
 """What is put into a chain or its sensors: which effects make sense there, how large they may be, and their parameters.
 
 Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
-"cos", "sin" and "omega" (of a drive, at all sites or at one), "offset_2" and "gain_2" (of the second sensor, which
-reads gain * u + offset), and "curve" (c in u + c u^2).
+"cos", "sin" and "omega" (of a drive, at all sites or at one), "offset_2", "gain_2" and "curve_2" (of the second sensor,
+which reads gain * u + offset + curve * u^2), and "curve" (one for all sensors).
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ AT_ONE_SITE = ("defect", MASSES)
 # At one site or bond, too; put in where they are asked for.
 LOCAL_DRIVE, LOCAL_DAMPING, BOND = "local-drive", "local-damping", "bond-defect"
 LOCAL = (LOCAL_DRIVE, LOCAL_DAMPING, BOND)
+# A curve that one sensor has alone; put in where it is asked for.
+OWN_CURVE = "own-sensor-curve"
 # Of Fermi, Pasta and Ulam, and of van der Pol; put in where they are asked for.
 LOSS = "nonlinear-damping"
 CLASSIC = ("quadratic-coupling", LOSS)
@@ -38,7 +40,7 @@ NAMES = (
 )  # fmt: skip
 # How often each is drawn, where 1 is not given: what most recordings have.
 OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
-ASKED = (*NAMES, *LOCAL, *CLASSIC)
+ASKED = (*NAMES, *LOCAL, OWN_CURVE, *CLASSIC)
 """Every effect that can be asked for."""
 HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
 """Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
@@ -110,7 +112,7 @@ def sensible(chain: Chain, reach: int, names: Sequence[str] = NAMES) -> list[str
     for name in names:
         if DECLARED.get(name) in chain.declared:
             continue
-        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING) and inner < 2:
+        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE) and inner < 2:
             continue
         if name == BOND and not (chain.coupled and inner > 2):
             continue
@@ -151,6 +153,8 @@ def ingredient(name: str, chain: Chain, site: int, sign: float = 1.0) -> Ingredi
     """Return an effect with one parameter; the site counts where it acts at one."""
     if name == CURVE:
         return Ingredient(name, None, {"curve": sign / chain.size}, 0.15, {})
+    if name == OWN_CURVE:
+        return Ingredient(CURVE, site, {f"curve_{site + 1}": sign / chain.size}, 0.15, {})
     if name == GAIN:
         return Ingredient(name, site, {f"gain_{site + 1}": sign}, 0.4, {})
     if name == MASSES:

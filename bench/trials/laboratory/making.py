@@ -295,7 +295,7 @@ def _beside(experiment: Experiment, chosen: Sequence[Ingredient], amounts: ndarr
         of.update({one.key(name): value for name, value in one.values(float(amount)).items()})
     offsets, gains = ([of.get(f"{name}_{k + 1}", 0.0) for k in range(chain.sites)] for name in ("offset", "gain"))
     outer = [k for k in range(chain.sites) if not reach <= k < chain.sites - reach]
-    if "curve" in of or not any(offsets[k] for k in outer):
+    if any(name.startswith("curve") for name in of) or not any(offsets[k] for k in outer):
         return {}
     moved = chain.displaced(
         {k: offsets[k] / (1 + gains[k]) for k in outer}, {name: np.array([[value]]) for name, value in of.items()}

@@ -319,7 +319,7 @@ class _Sensors:
             return np.concatenate([of.get(f"{name}_{k + 1}", zero) for k in range(sites)], axis=1)
 
         self.offset, self.gain = row("offset"), 1 + row("gain")
-        self.curve = of.get("curve", zero)
+        self.curve = of.get("curve", zero) + row("curve")
 
     def read(self, u: Float[ndarray, "copies sites"]) -> ndarray:
         """Return the readings."""

@@ -119,6 +119,26 @@ def test_a_recording_moves_by_the_formulas_of_its_effects_in_the_catalogue(names
     np.testing.assert_allclose(motion.unpack(exact.y)[0], one.clean[rows], rtol=0, atol=1e-6 * one.chain.size)
 
 
+def test_a_curve_of_one_sensor_bends_its_readings_and_no_others() -> None:
+    one = make_recording(3, "white", [effects.OWN_CURVE], sites=2)
+    (bent,) = one.effects
+    assert bent.name == "sensor-curve"
+    assert bent.site is not None
+    pairs = zip(one.coefficients.tolist(), one.declared.texts, strict=True)
+    motion = Motion(
+        Term(" + ".join(f"({size!r})*({text})" for size, text in pairs)), 2, is_complex=False, sites=2,
+        ends=one.chain.ends,
+    )  # fmt: skip
+    times = one.samples.t[:60]
+    exact = scipy.integrate.solve_ivp(
+        motion.right_hand_side, (0.0, times[-1]), motion.pack(*one.chain.start), t_eval=times, method="LSODA",
+        rtol=1e-10, atol=1e-10 * one.chain.size,
+    )  # fmt: skip
+    expected = motion.unpack(exact.y)[0]
+    expected[:, bent.site] += bent.parameters[f"curve_{bent.site + 1}"] * expected[:, bent.site] ** 2
+    np.testing.assert_allclose(expected, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
+
+
 @pytest.mark.parametrize("names", [["local-drive", "local-damping", "bond-defect"]])
 def test_what_acts_at_one_site_or_bond_is_what_an_equation_written_by_hand_says(names: list[str]) -> None:
     one = next(
