@@ -43,6 +43,9 @@ class Pool:
 
         Where all of these may stand in for something else, by a frequency, a time or a delay of their own, the best one
         that may not goes along: on short horizons it takes several effects to do what one such influence does.
+
+        So does the best one that has at least two effects less than each of these, if it is hardly behind: on short
+        horizons several effects may do what one does, and a little more.
         """
         found: list[Fitted] = []
         plain: Fitted | None = None
@@ -54,4 +57,13 @@ class Pool:
         if plain is not None and all(one.model.may_stand_in for one in found):
             behind = self.worth.value(plain) - self.worth.value(found[0])
             found += [plain] if behind <= rules.PLAINER else []
+        found += self._leaner(found)
         return sorted(found, key=self.worth.value)
+
+    def _leaner(self, leading: list[Fitted]) -> list[Fitted]:
+        most = min((len(one.model.effects) for one in leading), default=0) - 2
+        lean = [one for one in self._kept.values() if len(one.model.effects) <= most]
+        best = min(lean, key=self.worth.value, default=None)
+        if best is None or self.worth.value(best) - self.worth.value(leading[0]) > rules.LEANER:
+            return []
+        return [best]

@@ -31,7 +31,7 @@ from latticebench.diagnosis.regression import regressed, sustained
 from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.walk_estimate import won_by_walking
-from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, wald
+from latticebench.diagnosis.worth import Worth, beyond, displaced, fine, misfits, over, wald
 
 Watcher = Callable[[str], None]
 
@@ -301,7 +301,7 @@ class Search:
         model = fitted.model
         for number in range(len(model.effects)):
             if model.without(number) not in pool and not self._sure(fitted, number):
-                hope = fitted.cost + fitted.dispersion * own.price_of(model.effects[number])
+                hope = fitted.cost + fitted.dispersion * (own.price_of(model.effects[number]) + displaced(fitted))
                 found = self.without(fitted, number, hope)
                 if found is not None:
                     yield found
@@ -364,7 +364,7 @@ class Search:
                 model = fitted.model.without(number).with_effect(one.placed)
                 if model not in pool:
                     cheaper = self.problem.price_of(placed) - self.problem.price_of(one.placed)
-                    hope = fitted.cost + fitted.dispersion * max(cheaper, 0.0)
+                    hope = fitted.cost + fitted.dispersion * (max(cheaper, 0.0) + displaced(fitted))
                     other = self.exchanged(fitted, [number], one.placed, hope)
                     if other is not None:
                         yield other

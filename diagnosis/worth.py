@@ -88,19 +88,19 @@ def repelling(problem: Problem, model: Model) -> float:
 def displaced(fitted: Fitted) -> float:
     """Return the nats that a motion costs which is farther from its zero than its readings are from theirs.
 
-    It is ln(1 + d^2), with d the difference between the two distances of the mean, each in units of its own swing. By a
-    constant force and offsets that make it good, a sensor's curve passes for a gain: it is looked at from afar.
+    It is ln(1 + d^2), with d the difference between the two distances of the mean from zero, as root mean squares over
+    the sites and beside the swing of the motion. What a sensor reads counts in units of the motion there, and swings
+    that are less than the noise count as the noise.
     """
-    curves = fitted.curves()
-    moving = list(fitted.chain.moving)
+    curves, moving = fitted.curves(), list(fitted.chain.moving)
     read = np.concatenate([one.level[:, 0][..., moving] for one in curves])
     there = np.concatenate([one.field[:, 0][..., moving] for one in curves])
-    distance = []
-    for one in (there, read):
-        mean, swing = np.nanmean(one, axis=0), np.nanstd(one, axis=0)
-        distance.append(float(np.sqrt(np.mean(mean**2) / max(float(np.mean(swing**2)), 1e-300))))
-    farther = max(distance[0] - distance[1], 0.0)
-    return rules.DISPLACED * float(np.log1p(farther**2))
+    noise = fitted.noise.deviation()[: fitted.chain.sites][moving]
+    swings = [np.sqrt(np.nanvar(one, axis=0) + noise**2) for one in (there, read)]
+    means = np.nanmean(there, axis=0), np.nanmean(read, axis=0) * swings[0] / swings[1]
+    size = float(np.mean(swings[0] ** 2))
+    distances = [float(np.sqrt(np.mean(one**2) / size)) if size > 0 else 0.0 for one in means]
+    return rules.DISPLACED * float(np.log1p(max(distances[0] - distances[1], 0.0) ** 2))
 
 
 def wald(fitted: Fitted, number: int) -> float:

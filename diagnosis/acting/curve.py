@@ -60,7 +60,7 @@ class Curve(OfSensors, acts="curve"):
             size = np.hypot(u[:, 0], u[:, 1])[:, None]
             by[0, :, 0] = size * u
             slope[:, 0] = self.strength[0] * (size + u**2 / np.where(size > 0, size, 1.0))
-        by, slope = by * here, slope * here
+        by, slope = np.where(here, by, 0.0), np.where(here, slope, 0.0)
         return Misreading(np.tensordot(self.strength, by, 1), slope, by)
 
     def sentences(self, chain: Chain) -> list[str]:

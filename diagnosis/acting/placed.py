@@ -339,10 +339,11 @@ class Placed(ABC):
         """Return which measurement would tell this way of acting from another; nothing where both act alike."""
         if cls.instrument != other.instrument:
             return (cls if cls.instrument else other).separated_by or OTHER_SENSORS
-        if cls.local != other.local:
-            return ELSEWHERE
         # The same for either order of the two.
-        return "" if cls is other else max(cls.separated_by, other.separated_by)
+        known = "" if cls is other else max(cls.separated_by, other.separated_by)
+        if cls.local != other.local:
+            return (cls.instrument and known) or ELSEWHERE
+        return known
 
     def summands(self, chain: Chain) -> list[Summand]:  # noqa: ARG002
         """Return the terms that it brings to every site's equation."""

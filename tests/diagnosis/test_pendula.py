@@ -63,7 +63,7 @@ def test_a_motion_far_from_its_zero_costs_nats_as_cauchys_prior_has_it(away):
         one[..., :2] += away
     found = fit(Model(DECLARED, 2, (COUPLING, SPRING * -1), moved), layout, near, structure=Structure(), steps=0)
     assert found is not None
-    swing = np.sqrt(np.mean(np.var(u, axis=0)))
+    swing = np.sqrt(np.mean(np.var(u, axis=0) + found.noise.deviation() ** 2))
     mean = np.mean(u, axis=0)
     distances = [np.sqrt(np.mean((mean + shift) ** 2)) / swing for shift in (away, 0.0)]
     assert displaced(found) == pytest.approx(np.log1p(max(distances[0] - distances[1], 0.0) ** 2), rel=1e-3, abs=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.integrate import solve_ivp
 from latticebench import systems
 from latticebench.bench.trials.laboratory.making import make_recording
 from latticebench.bench.trials.trial import Trial
-from latticebench.diagnosis import rules
+from latticebench.diagnosis import pool, rules
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
 from latticebench.diagnosis.search import Search
@@ -86,6 +87,20 @@ def test_the_best_model_without_a_force_goes_along_if_it_is_not_too_far_behind(b
     found = next(one for one in horizons if one.models[0].model.may_stand_in)
     assert [one.model.may_stand_in for one in found.models] == [True] * rules.RIVALS + [False] * goes_along
     assert np.all(np.diff([behind for _, behind in found.horizons[-1].models]) >= 0)
+
+
+@pytest.mark.parametrize(("behind", "goes_along"), [(29.0, True), (31.0, False)])
+def test_the_best_model_with_two_effects_less_goes_along_if_it_is_not_too_far_behind(behind, goes_along, monkeypatch):
+    def model(value, count):
+        return SimpleNamespace(worth=value, model=SimpleNamespace(effects=range(count), may_stand_in=False))
+
+    leading = [model(0.0, 5), model(1.0, 4), model(2.0, 4)]
+    lean = [model(behind, 2), model(behind + 0.5, 1), model(3.0, 3)]
+    monkeypatch.setattr(pool, "same", lambda one, other: False)
+    models = pool.Pool(None, [])
+    models.worth = SimpleNamespace(value=lambda one: one.worth)
+    models._kept = dict(enumerate([*lean, *leading]))
+    assert models.leading() == [*leading, *lean[:1]][: 3 + goes_along]
 
 
 @pytest.mark.parametrize("omega", [0.7, 3.0])

@@ -197,11 +197,16 @@ def _others(
     """Return the sides, sensors (True) or forces, on which another effect or place is named for a true one."""
     sides: set[bool] = set()
     for one, j in zip(truth, pairs, strict=True):
-        if j is None or (found[j].name == one["name"] and one["name"] in ONE_FOR_ALL):
+        if j is None or (found[j].name == one["name"] and one["name"] in ONE_FOR_ALL and _alike(one, found, j)):
             continue
         if (found[j].name, found[j].site) != (one["name"], one["site"]):
             sides |= {_of_sensors(one["name"]), _of_sensors(found[j].name)}
     return frozenset(sides)
+
+
+def _alike(one: Mapping[str, Any], found: Sequence[Finding], j: int) -> bool:
+    """Return whether the sensors' numbers mean the same in the truth and in what is found: curves are those of one."""
+    return one["name"] != "sensor-curve" or set(one["parameters"]) == set(_together(found, j))
 
 
 def _unit(truth: Sequence[Mapping[str, Any]], found: Sequence[Finding], pairs: Sequence[int | None]) -> float:
@@ -243,7 +248,9 @@ def _beyond(
     """Return the names of findings that are not there."""
     spare = [one for j, one in enumerate(found) if j not in pairs]
     there = {one["name"] for one in truth}
-    return tuple(one.name for one in spare if not (one.name in ONE_FOR_ALL and one.name in there))
+    # A curve of one sensor besides that of all is another one.
+    every = {one.name for one in found if "curve" in one.values}
+    return tuple(one.name for one in spare if one.name in every or one.name not in there.intersection(ONE_FOR_ALL))
 
 
 def _together(found: Sequence[Finding], j: int) -> dict[str, tuple[float, float]]:

@@ -138,6 +138,32 @@ def test_where_a_force_does_the_work_of_another_the_sizes_of_forces_are_not_comp
     assert judge(truth, [*found[:1], said("drive")]).covered == (0, 1)
 
 
+@pytest.mark.parametrize(
+    ("curves", "covered", "invented"),
+    [
+        ([("curve_2", 0.11)], (2, 2), ()),
+        # Of another sensor, of all, and of both: these numbers cannot be compared, nor those of other sensors.
+        ([("curve_1", 0.1)], (0, 0), ()),
+        ([("curve", 0.1)], (0, 0), ()),
+        ([("curve_1", 0.1), ("curve_2", 0.1)], (0, 0), ()),
+        ([("curve", 0.1), ("curve_2", 0.1)], (0, 0), ("sensor-curve",)),
+    ],
+)
+def test_a_curve_of_one_sensor_is_compared_with_a_curve_of_that_sensor_alone(
+    curves: list[tuple[str, float]], covered: tuple[int, int], invented: tuple[str, ...]
+) -> None:
+    truth: list[dict[str, Any]] = [
+        {"name": "sensor-curve", "site": 1, "sites": [1], "alike": [], "parameters": {"curve_2": 0.1}},
+        {"name": "sensor-gain", "site": 1, "sites": [1], "alike": [], "parameters": {"gain_2": 1.5}},
+    ]
+    found = [said("sensor-gain", 1, gain_2=(1.51, 0.01))]
+    found += [said("sensor-curve", None, **{name: (value, 0.01)}) for name, value in curves]
+    judged = judge(truth, found)
+    assert judged.missed == ()
+    assert judged.covered == covered
+    assert judged.invented == invented
+
+
 def test_values_have_the_names_that_recordings_have_for_them() -> None:
     labels = {
         "offset of u1": 1.0, "gain of u12": 0.5, "curve of u": 2.0, "curve of u3": 8.0, "scale": 3.0,
