@@ -32,7 +32,8 @@ RIVALS = 3
 # them if it is at most so many nats behind. It is named if it forecasts better by more nats than it is behind (as if
 # forecasts left white noise) and leaves of them at most BEYOND_NOISE times the noise.
 PLAINER = 30.0
-# The best model with at least two effects less than each of these goes along, too, if it is at most so many nats behind.
+# The best model with at least two effects less than each of these goes along, too, if it is at most so many nats
+# behind: on short horizons several effects may do what one does, and a little more.
 LEANER = 30.0
 # Candidates of each model that are fitted in full, those of the highest score first.
 TRIED = 4
