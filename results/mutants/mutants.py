@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from latticebench.bench.escape import csv_text
 from latticebench.bench.provenance import origin
 from latticebench.bench.publish import markdown_table, render
 from latticebench.bench.published import read_head
@@ -192,7 +193,10 @@ def page() -> str:
 
 def _table() -> pd.DataFrame:
     path = HERE / "mutants.csv"
-    return pd.read_csv(path, comment="#", keep_default_na=False) if path.exists() else pd.DataFrame(columns=COLUMNS)
+    if not path.exists():
+        return pd.DataFrame(columns=COLUMNS)
+    table = pd.read_csv(path, comment="#", keep_default_na=False)
+    return table.map(lambda cell: csv_text(cell) if isinstance(cell, str) else cell)
 
 
 def main() -> None:
