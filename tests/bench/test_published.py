@@ -124,6 +124,8 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     classic = pd.read_csv(RESULTS / "loop" / "classic" / "summary.csv", comment="#", dtype=str)
     assert f"among two or three effects | {NAMED} | {share(classic['right'].iloc[0])} |" in words("diagnosis")
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
+    own = pd.read_csv(RESULTS / "loop" / "own-make" / "summary.csv", comment="#", dtype=str)
+    assert f"and no other in {share(own['right'].iloc[0])}." in words("diagnosis")
     first, later, third = (f"{one.split(' (')[0]} of {one.split()[-1]}" for one in exact)
     assert f"in {first}, {later} and {third} laboratory recordings" in readme
 
