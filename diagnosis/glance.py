@@ -1,6 +1,7 @@
-"""About how many nats forces would win, thousands of them at once.
+"""About how many nats influences with a frequency or a time would win, thousands of them at once.
 
-The slope of the likelihood by a force follows from its adjoint along the motion. Its curvature is a mean square over
+The slope of the likelihood by a force follows from its adjoint along the motion, that by what is added to readings from
+the readings alone. Its curvature is a mean square over
 random directions in the space of readings (Hutchinson, Commun. Stat. Simul. Comput. 18, 1059 (1989)).
 """
 
@@ -31,11 +32,11 @@ SIGNS = 0
 
 
 def glanced(tangent: Tangent, candidates: Sequence[Placed]) -> Float[ndarray, " candidates"]:
-    """Return about how many nats forces would win, without what each of them would do to the readings."""
+    """Return about how many nats candidates would win, without what each of them would do to the readings."""
     ends = np.cumsum([0, *map(columns_of, candidates)])
     by = np.zeros((ends[-1], 1 + DIRECTIONS))
-    for number, dual in enumerate(_duals(tangent)):
-        _Pull(tangent, number, dual).add(candidates, ends, by)
+    for number, readings in enumerate(_looked(tangent)):
+        _Pull(tangent, number, readings).add(candidates, ends, by)
     # What overflows along the motion wins nothing.
     by = np.where(np.isfinite(by), by, 0.0)
     size = np.linalg.norm(by[:, 1:], axis=1, keepdims=True)
@@ -78,29 +79,32 @@ def crowding(tangent: Tangent, placed: Placed, candidates: Sequence[Placed]) -> 
 class _Pull:
     """Derivatives of what one recording leaves, and of random directions, by the numbers of effects."""
 
-    def __init__(self, tangent: Tangent, number: int, dual: ndarray) -> None:
-        self.tangent, self.number, self.dual = tangent, number, dual
+    def __init__(self, tangent: Tangent, number: int, readings: ndarray) -> None:
+        self.tangent, self.number = tangent, number
         self.t, self.chain = tangent.along[number].t, tangent.fitted.chain
+        self.dual = _dual(tangent, number, readings * tangent.own(number)[..., None])
+        chain = self.chain
+        self.readings = readings.reshape(len(self.t), chain.levels, chain.parts, chain.sites, -1)[:, 0]
         self.courses: dict[InStep | None, ndarray] = {}
 
     def add(self, candidates: Sequence[Placed], ends: ndarray, by: ndarray) -> None:
         """Add those of all effects to their rows (numbers, 1 + D).
 
-        Forces that are one course in time at the same sites are taken together.
+        What is one course in time at the same sites is taken together.
         """
-        together: dict[tuple[str, bytes], list[tuple[Force, InStep | None, int]]] = {}
+        together: dict[tuple[bool, str, bytes], list[tuple[Force, InStep | None, int]]] = {}
         for one, begin, end in zip(candidates, ends, ends[1:], strict=False):
-            forces = [(force, force.factor) for force in one.forces(self.chain)]
+            forces = [(force, force.factor) for force in (*one.forces(self.chain), *one.courses(self.chain))]
             in_step = [(force, factor, begin) for force, factor in forces if isinstance(factor, InStep | None)]
             if one.scaled() is not None or one.other_ends() is not None or len(in_step) < len(forces):
                 by[begin:end] += self.tangent.push(self.number, one).reshape(end - begin, -1) @ self.dual
                 continue
             for each in in_step:
                 weights = b"" if each[0].weights is None else each[0].weights.tobytes()
-                together.setdefault((each[0].text, weights), []).append(each)
-        for same in together.values():
+                together.setdefault((one.instrument, each[0].text, weights), []).append(each)
+        for (instrument, *_), same in together.items():
             courses = np.stack([self._course(factor) for _, factor, _ in same])
-            pulled = courses @ self._in_time(same[0][0])
+            pulled = courses @ (self._added_in_time if instrument else self._in_time)(same[0][0])
             for (force, _, begin), value in zip(same, pulled, strict=True):
                 for k, share in force.by.items():
                     by[begin + k] += share * value
@@ -118,19 +122,20 @@ class _Pull:
             values = values * force.weights[list(self.chain.moving)]
         return np.asarray(np.einsum("rqn,rqnk->rk", values, self.dual.reshape(*values.shape, -1), optimize=True))
 
+    def _added_in_time(self, force: Force) -> ndarray:
+        """Return derivatives by the factor of what is added to readings of u at each time: (rows, 1 + D)."""
+        weights = np.ones(self.chain.sites) if force.weights is None else force.weights
+        return np.asarray(np.einsum("n,rnk->rk", weights, self.readings[:, int(force.text != "1")]))
 
-def _duals(tangent: Tangent) -> list[ndarray]:
-    """Return derivatives of what is left, and of random directions, by forces in each recording: (rows parts M, .)."""
+
+def _looked(tangent: Tangent) -> list[ndarray]:
+    """Return what is left, and random directions, by the readings of each recording: (rows, channels, 1 + D)."""
     layout, shape = tangent.fitted.layout, tangent.error.shape
     signs = np.random.default_rng(SIGNS).choice([-1.0, 1.0], (*shape, DIRECTIONS))
     looked = np.concatenate([tangent.left[:, None], tangent.new(by_pieces(layout, signs))], axis=1)
     readings = tangent.whitener.transposed(looked.reshape(*shape, -1) * tangent.robust[..., None])
-    found, begin = [], 0
-    for number, rows in enumerate(layout.rows):
-        part = readings[begin : begin + rows.size] * tangent.own(number)[..., None]
-        begin += rows.size
-        found.append(_dual(tangent, number, part))
-    return found
+    ends = np.cumsum([rows.size for rows in layout.rows])
+    return np.split(readings, ends[:-1])
 
 
 def _dual(tangent: Tangent, number: int, readings: ndarray) -> ndarray:

@@ -32,6 +32,8 @@ HOW: dict[str, str] = {
     "offset": "the reading is u + b; at one site, which is found, or with a b for every site",
     "drift": "the reading is u + d (t - t_0) / T, T being the recording's length; at one site, which is found",
     "wander": "the reading is u + w(t), w wandering at random, more slowly than the sites swing; at one site, found",
+    "hum": "the reading is u + a cos(omega s) + b sin(omega s), s counted from the middle; at one site or at all "
+    "alike; omega and site found",
     "gain": "the reading is g u; at one site, which is found, or with a g for every site",
     "curve": "the reading is u + c u^2, with one c for all sensors or at one of them",
     "clock": "the recorded times are wrong by a share of themselves",
@@ -267,6 +269,10 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "sensor-wander", "1", acts="wander", look_for="one sensor's residual that goes its own slow way",
         source="Durbin & Koopman, Time Series Analysis by State Space Methods (2012), section 2.2",
+    ),
+    Effect(
+        "sensor-hum", "1", acts="hum", look_for="lines in the spectrum of one sensor that its neighbours do not follow",
+        source="Kay, Fundamentals of Statistical Signal Processing: Estimation Theory (1993), example 4.2",
     ),
     Effect("sensor-gain", "u[n]", acts="gain", look_for="a residual in proportion to one site's reading", source=LJUNG),
     Effect(

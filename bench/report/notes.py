@@ -258,8 +258,8 @@ def _hum(diagnosis: Diagnosis) -> Iterator[str]:
         return
     for found in diagnosis.findings:
         frequency = found.placed.frequency or 0.0
-        free = all(force.text in ("1", "i*1") for force in found.placed.forces(diagnosis.after.chain))
-        if free and frequency > HUM * max(own) > 0:
+        texts = {force.text for force in found.placed.forces(diagnosis.after.chain)}
+        if texts and texts <= {"1", "i*1"} and frequency > HUM * max(own) > 0:
             yield (
                 f"The frequency of {found.name} is {frequency / max(own):.2g} times the highest of the chain's own: "
                 "hum that a sensor picks up would look the same. A recording of the chain at rest tells them apart."

@@ -84,7 +84,7 @@ def of_natural(name: str, units: Units, order: int = 2) -> tuple[float, str]:
     The number may be a coefficient of the equation: that of a term, at every site or at one, or of a term times a
     function of time.
     """
-    if name.startswith(("offset of ", "drift of ")):
+    if name.startswith(("offset of ", "drift of ", "hum of ")):
         return 1 / units.scale, units.reading
     if name.startswith("walk of "):
         # A standard deviation has no sign.
@@ -134,8 +134,8 @@ def of_coefficients(terms: Sequence[Term], order: int, units: Units) -> list[str
 
 
 def in_sentence(line: str, units: Units) -> str:
-    """Return a sentence about an effect with its offset or drift, or its time, in the units of the recording."""
-    zero = re.fullmatch(r"((?:offset|drift|walk) of \w+): (\S+)(.*)", line)
+    """Return a sentence about an effect with its offset, drift or hum, or its time, in the units of the recording."""
+    zero = re.fullmatch(r"((?:offset|drift|walk|hum) of \w+): (\S+)(.*)", line)
     if zero:
         factor, unit = of_natural(zero[1], units)
         return f"{zero[1]}: {with_unit(f'{float(zero[2]) * factor:.{DIGITS}g}', unit)}{zero[3]}"

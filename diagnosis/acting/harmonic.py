@@ -48,8 +48,8 @@ class Wave(InStep):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Harmonic(Placed, acts="harmonic"):
-    """A term times a cos(omega s) + b sin(omega s) with s = t - middle, at every site alike.
+class Swinging(Placed):
+    """A term times a cos(omega s) + b sin(omega s) with s = t - middle.
 
     Attributes:
         texts: T, or T and i*T for complex coefficients.
@@ -62,18 +62,6 @@ class Harmonic(Placed, acts="harmonic"):
     middle: float = 0.0
     shape: ClassVar[tuple[str, ...]] = ("omega",)
     timed: ClassVar[bool] = True
-    separated_by: ClassVar[str] = (
-        "another recording, begun at another time: what is driven from outside keeps its own time, whatever the chain "
-        "does"
-    )
-
-    @classmethod
-    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every frequency of the scene."""
-        texts = scene.terms(effect)
-        for omega in scene.frequencies if texts else ():
-            still = (0.0,) * (2 * len(texts))
-            yield cls(effect=effect, texts=texts, omega=float(omega), middle=scene.middle, strength=still)
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return cosine and sine of each term."""
@@ -96,13 +84,13 @@ class Harmonic(Placed, acts="harmonic"):
 
     def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:
         """Return the waves at the next frequencies to both sides, without those in the line that this one makes."""
-        alike = [one for one in others if isinstance(one, Harmonic) and one.place == self.place]
+        alike = [one for one in others if isinstance(one, Swinging) and one.place == self.place]
         alike.sort(key=lambda one: one.omega)
         here = bisect.bisect(alike, self.omega, key=lambda one: one.omega)
         near, far = rules.LINE, rules.AROUND
         return [*alike[max(here - far, 0) : max(here - near, 0)], *alike[here + near : here + far]]
 
-    def forces(self, chain: Chain) -> list[Force]:
+    def waves(self, chain: Chain) -> list[Force]:
         """Return the waves and, for the frequency, their derivatives by it."""
         last, count, share, found = len(self.strength), len(self.texts), self.share(chain), []
         for k, text in enumerate(self.texts):
@@ -117,6 +105,28 @@ class Harmonic(Placed, acts="harmonic"):
                     Force(text, 0.0, {last: b}, share, Wave("cos", self.omega, self.middle, 1)),
                 ]
         return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Harmonic(Swinging, acts="harmonic"):
+    """A force that swings, at every site alike."""
+
+    separated_by: ClassVar[str] = (
+        "another recording, begun at another time: what is driven from outside keeps its own time, whatever the chain "
+        "does"
+    )
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return every frequency of the scene."""
+        texts = scene.terms(effect)
+        for omega in scene.frequencies if texts else ():
+            still = (0.0,) * (2 * len(texts))
+            yield cls(effect=effect, texts=texts, omega=float(omega), middle=scene.middle, strength=still)
+
+    def forces(self, chain: Chain) -> list[Force]:
+        """Return the waves and, for the frequency, their derivatives by it."""
+        return self.waves(chain)
 
     def summands(self, chain: Chain) -> list[Summand]:
         """Return the waves."""

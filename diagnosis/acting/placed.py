@@ -282,6 +282,10 @@ class Placed(ABC):
         """Return the terms that it adds to the right-hand side."""
         return []
 
+    def courses(self, chain: Chain) -> list[Force]:  # noqa: ARG002
+        """Return what it adds to readings of u in time, whatever the field: terms "1" and "i*1" with their factors."""
+        return []
+
     def scaled(self) -> int | None:
         """Return the site whose whole right-hand side is multiplied by 1 + the strength; None where there is none."""
         return None

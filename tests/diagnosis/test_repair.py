@@ -13,6 +13,7 @@ from latticebench.bench.trials.laboratory import make_recording
 from latticebench.bench.trials.laboratory.instruments import Kind
 from latticebench.bench.trials.laboratory.judging import findings, judge, written
 from latticebench.bench.trials.specimen import Conditions, make
+from latticebench.diagnosis.cure import corrected
 from latticebench.diagnosis.repair import Interrupted, diagnose
 from latticebench.systems import find
 from latticebench.systems.effects import CATALOGUE
@@ -109,6 +110,35 @@ def test_a_zero_that_wanders_is_named_with_its_sensor_and_how_far_it_goes_and_le
     (curve,) = found.after.curves()
     assert np.nanstd(curve.level[:, 0, 0, 1] - curve.field[:, 0, 0, 1] - walk) < recording.noise[1]
     assert found.forecast[1] <= found.forecast[0]
+
+
+def humming(sensors):
+    """A recording of two sites with a hum of six times the noise, what is found in it, and size and frequency."""
+    recording = made(NONE)
+    read, size, omega = recording.samples, 6 * recording.noise[1], 0.7 * recording.chain.fast
+    here = np.isin(np.arange(read.sites), sensors)
+    found = diagnosed_as(recording, replace(read, u=read.u + np.outer(size * np.cos(omega * read.t), here)))
+    return recording, found, size, omega
+
+
+def test_a_hum_of_one_sensor_is_named_with_its_size_and_its_frequency_and_can_be_taken_away():
+    recording, found, size, omega = humming([1])
+    (one,) = found.findings
+    assert (one.name, one.site, found.verdict) == ("sensor-hum", 1, "explained")
+    value, error = one.values["omega"]
+    assert abs(value - omega) < 4 * error < 0.1 * omega
+    assert np.linalg.norm(one.placed.strength) == pytest.approx(size, rel=0.15)
+    assert found.residual[1] == pytest.approx(1, abs=0.1)
+    left = corrected(found.after.model, found.data[0]).u - recording.samples.u
+    assert np.sqrt(np.mean(left**2)) < 0.1 * size
+
+
+def test_a_hum_of_all_sensors_alike_cannot_be_told_from_a_force_on_all_sites_of_a_linear_chain():
+    _, found, _, omega = humming([0, 1])
+    (one,) = found.findings
+    assert {"sensor-hum", "drive"} <= {one.name, *one.alternatives}
+    assert one.site is None
+    assert one.values["omega"][0] == pytest.approx(omega, rel=0.02)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.diagnosis.fitting import fit
-from latticebench.diagnosis.glance import PROMISING, _duals, _Pull, most_promising
+from latticebench.diagnosis.glance import PROMISING, _looked, _Pull, most_promising
 from latticebench.diagnosis.horizon import Layout, follow
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
@@ -84,11 +84,24 @@ def test_a_force_at_one_site_is_glanced_at_as_one_at_every_site_is(problem, plai
     """The short way, by what a force's course in time does, agrees with the long one, by the force itself."""
     tangent = Tangent(plain)
     one = nearest_drive(problem)
-    dual = _duals(tangent)[0]
+    pull = _Pull(tangent, 0, _looked(tangent)[0])
     for placed in (one, next(one for one in problem.candidates if one.effect.name == "local-drive")):
-        long = tangent.push(0, placed).reshape(len(placed.numbers), -1) @ dual
+        long = tangent.push(0, placed).reshape(len(placed.numbers), -1) @ pull.dual
         short = np.zeros_like(long)
-        _Pull(tangent, 0, dual).add([placed], np.array([0, len(long)]), short)
+        pull.add([placed], np.array([0, len(long)]), short)
+        np.testing.assert_allclose(short, long, rtol=1e-9, atol=1e-9 * np.max(np.abs(long)))
+
+
+def test_a_hum_is_glanced_at_by_what_it_adds_to_the_readings(problem, plain):
+    tangent = Tangent(plain)
+    looked = _looked(tangent)[0]
+    hums = [one for one in problem.candidates if one.effect.name == "sensor-hum"]
+    for placed in (hums[3], hums[-4]):
+        placed = placed.moved([0.3, -0.2, placed.frequency])
+        by = placed.misread(tangent.along[0].t, tangent.along[0].field).by
+        long = by.reshape(len(by), -1) @ looked.reshape(by[0].size, -1)
+        short = np.zeros_like(long)
+        _Pull(tangent, 0, looked).add([placed], np.array([0, len(long)]), short)
         np.testing.assert_allclose(short, long, rtol=1e-9, atol=1e-9 * np.max(np.abs(long)))
 
 

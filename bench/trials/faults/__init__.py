@@ -81,6 +81,7 @@ MISREADINGS = {
     "sensor-curve": _misread(instrument.curve),
     "sensor-drift": _misread(instrument.drift),
     "sensor-wander": _misread(instrument.wander),
+    "sensor-hum": _misread(instrument.humming),
     # Where only u is read, another unit of time does the same.
     "clock": replace(_misread(instrument.slow_clock), only="second order"),
 }

@@ -51,6 +51,13 @@ def wander(setting: Setting, size: float) -> Fields:
     return u + size * setting.drawn.wander[:, None] * setting.one, v
 
 
+def humming(setting: Setting, size: float) -> Fields:
+    """Let one sensor of u hum."""
+    u, v = setting.run()
+    about = setting.drawn.about
+    return u + size * np.cos(about["hum"] * setting.times + about["hum_phase"])[:, None] * setting.one, v
+
+
 def slow_clock(setting: Setting, size: float) -> Fields:
     """Read each row late by a share of the time since the first."""
     begin = setting.times[0]

@@ -1,8 +1,8 @@
 """What is put into a chain or its sensors: which effects make sense there, how large they may be, and their parameters.
 
 Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
-"cos", "sin" and "omega" (of a drive, at all sites or at one), "offset_2", "gain_2" and "curve_2" (of the second sensor,
-which reads gain * u + offset + curve * u^2), and "curve" (one for all sensors).
+"cos", "sin" and "omega" (of a drive, at all sites or at one, or of a sensor's hum), "offset_2", "gain_2" and "curve_2"
+(of the second sensor, which reads gain * u + offset + curve * u^2), and "curve" (one for all sensors).
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ LOCAL_DRIVE, LOCAL_DAMPING, BOND = "local-drive", "local-damping", "bond-defect"
 LOCAL = (LOCAL_DRIVE, LOCAL_DAMPING, BOND)
 # A curve that one sensor has alone; put in where it is asked for.
 OWN_CURVE = "own-sensor-curve"
+# A sensor that hums, likewise; as fast as to be read so many times in half a period at least.
+HUM, PER_HALF = "sensor-hum", 1.25
 # Of Fermi, Pasta and Ulam, and of van der Pol; put in where they are asked for.
 LOSS = "nonlinear-damping"
 CLASSIC = ("quadratic-coupling", LOSS)
@@ -40,7 +42,7 @@ NAMES = (
 )  # fmt: skip
 # How often each is drawn, where 1 is not given: what most recordings have.
 OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
-ASKED = (*NAMES, *LOCAL, OWN_CURVE, *CLASSIC)
+ASKED = (*NAMES, *LOCAL, OWN_CURVE, HUM, *CLASSIC)
 """Every effect that can be asked for."""
 HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
 """Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
@@ -76,6 +78,8 @@ class Ingredient:
 
     def key(self, parameter: str) -> str:
         """Return the name of one of its parameters among all of a chain's, see `Chain.rate`."""
+        if self.name == HUM:
+            return f"hum.{parameter}@{self.site}"
         if self.name in (DRIVE, LOCAL_DRIVE):
             return f"drive.{parameter}" + ("" if self.site is None else f"@{self.site}")
         if self.name == "disorder":
@@ -112,7 +116,7 @@ def sensible(chain: Chain, reach: int, names: Sequence[str] = NAMES) -> list[str
     for name in names:
         if DECLARED.get(name) in chain.declared:
             continue
-        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE) and inner < 2:
+        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM) and inner < 2:
             continue
         if name == BOND and not (chain.coupled and inner > 2):
             continue
@@ -140,6 +144,12 @@ def draw_ingredient(name: str, chain: Chain, reach: int, draw: np.random.Generat
         return _offset(chain, inner, draw)
     if name == GAIN:
         return _gain(chain, inner, draw)
+    if name == HUM:
+        phase = draw.uniform(0, 2 * np.pi)
+        highest = min(4 * chain.fast, np.pi / PER_HALF * (chain.readings - 1) / chain.span)
+        omega = np.exp(draw.uniform(np.log(0.3 * chain.slow), np.log(highest)))
+        waves = {"cos": chain.size * np.cos(phase), "sin": chain.size * np.sin(phase)}
+        return Ingredient(name, site, waves, 0.5, {"omega": float(omega)})
     if name in (DRIVE, LOCAL_DRIVE):
         phase = draw.uniform(0, 2 * np.pi)
         force = chain.slow**2 * chain.size

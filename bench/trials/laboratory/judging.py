@@ -38,7 +38,7 @@ POWERS = {
     "drive": 1, "local-drive": 1, "sensor-curve": -2, "sensor-gain": -1,
 }  # fmt: skip
 # The label of a wave, and minus the time since which its phase is counted.
-WAVE = r"(cos|sin)\(.*\*(?:t|\(t([+-][^()]*)\))\)"
+WAVE = r"(?:hum of u\d*, )?(cos|sin)\(.*\*(?:t|\(t([+-][^()]*)\))\)"
 # Labels of values that are no coefficient of a term, with the names that recordings have for them.
 NAMED = {"omega": "omega", "curve of u": "curve", "scale": "scale"}
 # Half the width of a 95 % interval, in standard errors.

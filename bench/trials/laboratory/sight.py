@@ -249,7 +249,7 @@ class Experiment:
             return None
         u = np.moveaxis(found.y.reshape(*start.shape, -1)[0], -1, 0)
         pairs = zip(self.times, u, strict=True)
-        return np.moveaxis(np.stack([sensors.read(held(float(t), row)) for t, row in pairs]), 0, 1)
+        return np.moveaxis(np.stack([sensors.read(float(t), held(float(t), row)) for t, row in pairs]), 0, 1)
 
 
 class _Table:
@@ -320,13 +320,21 @@ class _Sensors:
 
         self.offset, self.gain = row("offset"), 1 + row("gain")
         self.curve = of.get("curve", zero) + row("curve")
+        sites_that_hum = [name.removeprefix("hum.cos@") for name in of if name.startswith("hum.cos")]
+        self.hums = {int(k): [of[f"hum.{name}@{k}"] for name in ("cos", "sin", "omega")] for k in sites_that_hum}
 
-    def read(self, u: Float[ndarray, "copies sites"]) -> ndarray:
+    def read(self, t: float, u: Float[ndarray, "copies sites"]) -> ndarray:
         """Return the readings."""
-        return np.asarray(self.gain * u + self.offset + self.curve * u**2)
+        found = np.asarray(self.gain * u + self.offset + self.curve * u**2)
+        for site, (cos, sin, omega) in self.hums.items():
+            found[:, site] += (cos * np.cos(omega * t) + sin * np.sin(omega * t))[:, 0]
+        return found
 
     def held(self, u: Float[ndarray, "copies sites"], outer: Sequence[int]) -> ndarray:
-        """Return positions with the outer ones such that every copy has the readings of the first there."""
+        """Return positions with the outer ones such that every copy has the readings of the first there.
+
+        Outer sensors do not hum.
+        """
         if not outer:
             return u
         first = u[0]

@@ -119,6 +119,26 @@ def test_a_recording_moves_by_the_formulas_of_its_effects_in_the_catalogue(names
     np.testing.assert_allclose(motion.unpack(exact.y)[0], one.clean[rows], rtol=0, atol=1e-6 * one.chain.size)
 
 
+def test_the_hum_of_a_sensor_is_in_its_readings_and_does_not_move_the_chain() -> None:
+    one = make_recording(4, "white", [effects.HUM], sites=3)
+    (hum,) = one.effects
+    assert hum.site is not None
+    motion = Motion(
+        Term(" + ".join(f"({size!r})*({text})" for size, text in zip(
+            one.coefficients.tolist(), one.declared.texts, strict=True
+        ))), 2, is_complex=False, sites=3, ends=one.chain.ends,
+    )  # fmt: skip
+    times = one.samples.t[:60]
+    exact = scipy.integrate.solve_ivp(
+        motion.right_hand_side, (0.0, times[-1]), motion.pack(*one.chain.start), t_eval=times, method="LSODA",
+        rtol=1e-10, atol=1e-10 * one.chain.size,
+    )  # fmt: skip
+    expected = motion.unpack(exact.y)[0]
+    phase = hum.parameters["omega"] * times
+    expected[:, hum.site] += hum.parameters["cos"] * np.cos(phase) + hum.parameters["sin"] * np.sin(phase)
+    np.testing.assert_allclose(expected, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
+
+
 def test_a_curve_of_one_sensor_bends_its_readings_and_no_others() -> None:
     one = make_recording(3, "white", [effects.OWN_CURVE], sites=2)
     (bent,) = one.effects

@@ -72,6 +72,14 @@ def test_the_zero_of_one_sensor_wanders_in_steps_that_know_nothing_of_one_anothe
 
 
 @pytest.mark.parametrize("name", BOTH)
+def test_one_sensor_hums_at_one_frequency(name):
+    shown, true, one = lied(name, "sensor-hum")
+    site, t = int(one.about["site"]), one.clean.t
+    wave = np.real(one.amount) * np.cos(one.about["hum"] * t + one.about["hum_phase"])
+    np.testing.assert_allclose(shown - true, wave[:, None] * (np.arange(true.shape[1]) == site), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", BOTH)
 def test_a_drifting_sensor_warms_up(name):
     shown, true, one = lied(name, "other: drifting-sensor")
     site, t = int(one.about["site"]), one.clean.t
