@@ -124,7 +124,8 @@ class Search:
         """Return the first fits on the longest pieces if the declared equation alone nearly follows these.
 
         The parts of the noise model are those that short pieces show: on long ones, what is missing looks like noise
-        with a memory.
+        with a memory. From fits of short pieces no straight way may lead to the best one of long pieces: the declared
+        equation starts from what the regression gives it.
         """
         whole = lengths.longest(self.problem)
         found = self._begun(self._declared, self.problem, self.layout(whole), CHANGED) if first else None
@@ -133,7 +134,8 @@ class Search:
         ratio = over(self.problem, found)
         if not np.any(np.isfinite(ratio)) or np.sqrt(np.nanmean(ratio**2)) > rules.AT_ONCE:
             return []
-        return self._carried(Found(first[0], tuple(first[1:]), ()), whole)
+        rivals = [one for one in first if one.model.effects]
+        return self._laid([found, *rivals], found, whole)
 
     @functools.cached_property
     def _declared(self) -> Model:
@@ -187,20 +189,24 @@ class Search:
         """Return the declared equation and the best models on a longer horizon."""
         self.small = fine(self.problem, last.models[0])
         self._choose_structure(last.models[0])
-        laid, carry = functools.partial(self.layout, length), functools.partial(self.carry, last.models[0])
-        on_inputs = interpolations(self.problem, early=len(last.horizons) == 1)
+        return self._laid(last.models, last.before, length, early=len(last.horizons) == 1)
+
+    def _laid(self, models: Sequence[Fitted], before: Fitted, length: int, *, early: bool = False) -> list[Fitted]:
+        """Return the declared equation, `before` until now, and other models on pieces of a length, the best first."""
+        laid, carry = functools.partial(self.layout, length), functools.partial(self.carry, models[0])
+        on_inputs = interpolations(self.problem, early=early)
         border = len(self.problem.plain.border) > 0
         if len(on_inputs) > 1 or not border:
             self.problem, best = likeliest(on_inputs, lambda one: carry(laid(one)))
         if border:
             self.problem, best = finest(self.problem, laid, carry)
         layout = self.layout(length) if best is None else best.layout
-        more = (self.carry(one, layout) for one in last.models[1:])
+        more = (self.carry(one, layout) for one in models[1:])
         fits = [found for found in (best, *more) if found is not None]
         if not fits:
             return []
-        plain = next((one for one in fits if not one.model.effects), None) or self.carry(last.before, layout)
-        return [plain or last.before, *fits]
+        plain = next((one for one in fits if not one.model.effects), None) or self.carry(before, layout)
+        return [plain or before, *fits]
 
     def carry(self, fitted: Fitted, layout: Layout, steps: int = CARRIED, hope: float = np.inf) -> Fitted | None:
         """Return a model on another layout, from where it ended."""

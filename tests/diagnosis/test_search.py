@@ -44,6 +44,20 @@ def test_where_no_model_can_be_followed_further_what_acts_at_times_of_its_own_is
     assert "drive" in [one.effect.name for one in second.models[0].model.effects]
 
 
+def test_a_weak_mode_of_a_long_recording_does_not_lead_the_coefficients_astray():
+    """Three sites for 35 periods: a wave as weak as the noise tells coupling from spring, on long pieces only."""
+    t, modes = np.linspace(0, 150, 550), [(1, 1, 1), (1, 0, -1), (1, -2, 1)]
+    swings = zip((0.01, 0.18, 0.012), np.sqrt([1.0, 2.25, 4.75]), modes, strict=True)
+    u = sum(size * np.outer(np.cos(omega * t + k), mode) for k, (size, omega, mode) in enumerate(swings))
+    read = u + 0.008 * np.random.default_rng(3).standard_t(4, size=u.shape) / np.sqrt(2)
+    names = ("ends", "damping", "onsite-cubic", "asymmetric-coupling")
+    chain = library("chain", "u[n+1]+u[n-1]-2*u[n]; u[n]")
+    data = Samples(t, read, source="chain", ends="free")
+    found = diagnose(chain, 2, [data], [one for one in CATALOGUE if one.name in names])
+    assert found.verdict == "nothing missing"
+    np.testing.assert_allclose(found.declared[0], [1.25, -1.0], atol=0.003)
+
+
 @pytest.mark.slow
 def test_a_strong_force_below_the_motions_own_frequency_is_named(driven):
     found = diagnose(SPRING, 2, [driven], CATALOGUE)

@@ -132,7 +132,7 @@ def test_an_effect_that_is_there_is_not_doubted(name, force):
 @pytest.mark.parametrize(
     ("name", "force"),
     [
-        ("local-drive", lambda t, u, v: 0.05 * np.cos(2.6 * t) * np.eye(len(u))[1]),
+        ("local-drive", lambda t, u, v: 0.05 * np.cos(1.9 * t) * np.eye(len(u))[1]),
         pytest.param("local-damping", lambda t, u, v: -0.05 * np.eye(len(u))[1] * v, marks=pytest.mark.slow),
         pytest.param(
             "local-kick",
