@@ -84,11 +84,11 @@ def of_natural(name: str, units: Units, order: int = 2) -> tuple[float, str]:
     The number may be a coefficient of the equation: that of a term, at every site or at one, or of a term times a
     function of time.
     """
+    if re.match(r"(walk|hum) of \w+$", name):
+        # A standard deviation has no sign, nor has how far a hum goes to either side.
+        return 1 / abs(units.scale), units.reading
     if name.startswith(("offset of ", "drift of ", "hum of ")):
         return 1 / units.scale, units.reading
-    if name.startswith("walk of "):
-        # A standard deviation has no sign.
-        return 1 / abs(units.scale), units.reading
     if name == "omega":
         return 1.0, rate_of("rad", units.time)
     if name in TIMES or name.endswith(" time"):
@@ -135,6 +135,8 @@ def of_coefficients(terms: Sequence[Term], order: int, units: Units) -> list[str
 
 def in_sentence(line: str, units: Units) -> str:
     """Return a sentence about an effect with its offset, drift or hum, or its time, in the units of the recording."""
+    if re.search(r" angular frequency [\d.e+-]+$", line):
+        line = with_unit(line, rate_of("rad", units.time))
     zero = re.fullmatch(r"((?:offset|drift|walk|hum) of \w+): (\S+)(.*)", line)
     if zero:
         factor, unit = of_natural(zero[1], units)

@@ -84,7 +84,10 @@ class Swinging(Placed):
 
     def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:
         """Return the waves at the next frequencies to both sides, without those in the line that this one makes."""
-        alike = [one for one in others if isinstance(one, Swinging) and one.place == self.place]
+        alike = [
+            one for one in others
+            if one.effect is self.effect and isinstance(one, Swinging) and one.place == self.place
+        ]  # fmt: skip
         alike.sort(key=lambda one: one.omega)
         here = bisect.bisect(alike, self.omega, key=lambda one: one.omega)
         near, far = rules.LINE, rules.AROUND

@@ -39,7 +39,11 @@ class Hum(OfSensors, Swinging, acts="hum"):
 
     def share(self, chain: Chain) -> Float[ndarray, " sites"] | None:
         """Return 1 at the sensors that hum, 0 elsewhere; None where all do."""
-        return None if len(self.sites) == chain.sites else np.isin(np.arange(chain.sites), self.sites).astype(float)
+        if len(self.sites) == chain.sites:
+            return None
+        found = np.zeros(chain.sites)
+        found[list(self.sites)] = 1.0
+        return found
 
     def labels(self, chain: Chain) -> tuple[str, ...]:
         """Return cosine and sine of each column that hums."""

@@ -20,6 +20,10 @@ MIRRORED = Units(time="s", reading="mm", equation="m", scale=-0.001)
         ("drift of u3: -0.5 over the recording", "drift of u3: 500 mm over the recording"),
         # A standard deviation has no sign, whichever way the sensor counts.
         ("walk of u2: 0.5 over the recording, and so on", "walk of u2: 500 mm over the recording, and so on"),
+        (
+            "hum of u1: 0.002 to either side of u, at the angular frequency 6.86",
+            "hum of u1: 2 mm to either side of u, at the angular frequency 6.86 rad/s",
+        ),
         ("the ends are fixed", "the ends are fixed"),
     ],
 )
