@@ -116,7 +116,8 @@ def errors(report: Report) -> Table:
 def modes(report: Report) -> Table:
     """Return each peak of the recording's spectrum with the nearest mode of the models, and how long that lasts.
 
-    Where the spectrum has no peaks, the modes of the last model are listed.
+    Where an effect swings nearer to the peak than a mode of the last model, it stands there with its name. Where the
+    spectrum has no peaks, the modes of the last model are listed.
     """
     unit = report.recording.units.time
     time = f" ({unit})" if unit else ""
@@ -127,10 +128,22 @@ def modes(report: Report) -> Table:
     for place in places[:LISTED]:
         pair = [_nearest(side, place) for side in (every.before, every.after)]
         shown = [_swing(one) for one in pair] + [_decay_time(one) for one in pair]
+        line = min(_lines(report), key=lambda one: abs(one[0] - place), default=None)
+        if line and (pair[1] is None or abs(line[0] - place) < abs(pair[1].frequency - place)):
+            shown[1::2] = [f"{line[0]:.5g}, {line[1]}", "none"]
         rows.append([f"{place:.5g}" if every.recording else "-", *shown])
     if len(places) > LISTED:
         rows.append([f"... and {len(places) - LISTED} more, in the JSON", "", "", "", ""])
     return columns, rows
+
+
+def _lines(report: Report) -> list[tuple[float, str]]:
+    """Return the frequencies of what swings from outside, forces and hum, with the names of these effects."""
+    return [
+        (float(one.parameters["omega"]), one.effect)
+        for one in report.effects
+        if "omega" in one.parameters and all(name.endswith(")") for name in one.coefficients)
+    ]
 
 
 def _nearest(modes: tuple[Mode, ...], place: float) -> Mode | None:

@@ -22,6 +22,7 @@ from latticebench.bench.report.text import show
 from latticebench.bench.report.whereabouts import scaled_residuals, whereabouts
 from latticebench.diagnosis.acting import Chain, Placed
 from latticebench.diagnosis.acting.everywhere import Everywhere
+from latticebench.diagnosis.acting.harmonic import Harmonic
 from latticebench.diagnosis.acting.pulse import Pulse
 from latticebench.diagnosis.noise import Noise
 from latticebench.diagnosis.repair import NAMELESS, NOT_FOLLOWED, NOT_REACHED, SMALL
@@ -147,6 +148,22 @@ def test_modes_of_both_models_stand_beside_the_peaks_of_the_recording(pendula: M
     recording, before, _ = pendula().modes
     growing = pendula(modes=(recording, before, [SimpleNamespace(frequency=3.0, decay=-0.1)]))
     assert rows.modes(content(growing))[1][0][-1] == "grows, 10"
+
+
+@pytest.mark.parametrize(("text", "shown"), [("1", ["3", "3.25, drive"]), ("u[n]", ["3", "3.35"])])
+def test_a_peak_that_a_force_makes_has_its_name_and_one_beside_what_is_modulated_has_not(
+    pendula: Made, text: str, shown: list[str]
+) -> None:
+    force = Harmonic(effect=find("drive"), texts=(text,), omega=3.25, strength=(0.1, 0.2))
+    numbers = zip((*force.labels(pendula().after.chain), "omega"), force.numbers, strict=True)
+    values = {name: (float(value), 0.01) for name, value in numbers}
+    one = SimpleNamespace(placed=force, alternatives=(), evidence=9.0, values=values, name="drive")
+    recording, before, after = pendula().modes
+    far = [after[0], SimpleNamespace(frequency=3.35, decay=0.05)]
+    found = pendula(findings=(one,), modes=([recording[0], SimpleNamespace(frequency=3.26, decay=0.0)], before, far))
+    table = rows.modes(content(found))[1]
+    assert [row[2] for row in table] == shown
+    assert (table[1][4] == "none") == (text == "1")
 
 
 def test_modes_are_listed_where_the_spectrum_has_no_peaks(pendula: Made) -> None:
