@@ -124,11 +124,14 @@ class Search:
         """Return the first fits on the longest pieces if the declared equation alone nearly follows these.
 
         The parts of the noise model are those that short pieces show: on long ones, what is missing looks like noise
-        with a memory. From fits of short pieces no straight way may lead to the best one of long pieces: the declared
-        equation starts from what the regression gives it.
+        with a memory. On long pieces there may be several best fits near by, a wave of a weak mode apart: the declared
+        equation comes there at once, from what the regression gives it, and by way of all lengths between.
         """
+        if not first:
+            return []
         whole = lengths.longest(self.problem)
-        found = self._begun(self._declared, self.problem, self.layout(whole), CHANGED) if first else None
+        ways = [self._begun(self._declared, self.problem, self.layout(whole), CHANGED), self._led(first[0], whole)]
+        found = min((one for one in ways if one is not None), key=lambda one: one.cost, default=None)
         if found is None or not found.converged:
             return []
         ratio = over(self.problem, found)
@@ -136,6 +139,13 @@ class Search:
             return []
         rivals = [one for one in first if one.model.effects]
         return self._laid([found, *rivals], found, whole)
+
+    def _led(self, fitted: Fitted, length: int) -> Fitted | None:
+        """Return the fit of a model on pieces of a length, by way of all between; None where the way ends before."""
+        found: Fitted | None = fitted
+        while found is not None and found.longest < length:
+            found = self.carry(found, self.layout(lengths.longer(self.problem, found.longest, settled=False)[0]))
+        return found
 
     @functools.cached_property
     def _declared(self) -> Model:

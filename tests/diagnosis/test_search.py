@@ -58,6 +58,22 @@ def test_a_weak_mode_of_a_long_recording_does_not_lead_the_coefficients_astray()
     np.testing.assert_allclose(found.declared[0], [1.25, -1.0], atol=0.003)
 
 
+@pytest.mark.parametrize("seed", [503, 505, 522])
+def test_the_declared_equation_is_not_lost_beside_its_best_fit_a_wave_of_a_weak_mode_away(seed):
+    """Begun at once, or carried there from short pieces, one or the other is hundreds of nats behind."""
+    recording = make_recording(seed, "proportional", (), sites=2)
+    names = ("damping", "sensor-offset")
+    catalogue = [one for one in CATALOGUE if one.name in names]
+    problem = Problem.of(recording.declared, 2, [recording.samples], catalogue)
+    search = Search(problem, lambda _: None)
+    (found,) = search.horizons()
+    assert found.whole
+    true = replace(found.before.model, coefficients=tuple(recording.coefficients))
+    best = search.refit(true, found.before.layout, found.before.followed.nodes, found.before, 25)
+    assert found.before.cost < best.cost + 0.5
+    assert found.models[0].model.names == ()
+
+
 @pytest.mark.slow
 def test_a_strong_force_below_the_motions_own_frequency_is_named(driven):
     found = diagnose(SPRING, 2, [driven], CATALOGUE)
