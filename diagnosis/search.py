@@ -125,12 +125,15 @@ class Search:
 
         The parts of the noise model are those that short pieces show: on long ones, what is missing looks like noise
         with a memory. On long pieces there may be several best fits near by, a wave of a weak mode apart: the declared
-        equation comes there at once, from what the regression gives it, and by way of all lengths between.
+        equation comes there at once, from what the regression gives it, and by way of all lengths between; not where
+        the ends are unknown, for the curves of the outer sites are others at each length, and take long to find.
         """
         if not first:
             return []
         whole = lengths.longest(self.problem)
-        ways = [self._begun(self._declared, self.problem, self.layout(whole), CHANGED), self._led(first[0], whole)]
+        ways = [self._begun(self._declared, self.problem, self.layout(whole), CHANGED)]
+        if not len(self.problem.plain.border):
+            ways.append(self._led(first[0], whole))
         found = min((one for one in ways if one is not None), key=lambda one: one.cost, default=None)
         if found is None or not found.converged:
             return []
