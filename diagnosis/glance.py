@@ -125,7 +125,7 @@ class _Pull:
     def _added_in_time(self, force: Force) -> ndarray:
         """Return derivatives by the factor of what is added to readings of u at each time: (rows, 1 + D)."""
         weights = np.ones(self.chain.sites) if force.weights is None else force.weights
-        return np.asarray(np.einsum("n,rnk->rk", weights, self.readings[:, int(force.text != "1")]))
+        return np.asarray(np.einsum("n,rnk->rk", weights, self.readings[:, int(force.text.startswith("i*"))]))
 
 
 def _looked(tangent: Tangent) -> list[ndarray]:

@@ -15,7 +15,7 @@ from latticebench.diagnosis.problem import GAP, Problem
 from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
     from numpy import ndarray
 
 # The strongest lines of the spectrum that a force from outside may sustain, and how many of them at once.
@@ -85,6 +85,11 @@ def sustained(problem: Problem) -> list[Model]:
     return [*found, *(with_lines([k]) for k in alone[1:])]
 
 
+def _whole(times: Float[ndarray, " time"], window: int, step: float) -> Bool[ndarray, " windows"]:
+    """Return which stretches of so many steps hold no gap."""
+    return np.asarray(times[window:] - times[:-window] < GAP * window * step)
+
+
 def _solved(design: Float[ndarray, "rows numbers"], target: Float[ndarray, " rows"]) -> tuple[ndarray, float]:
     """Return the solution of least squares, and the share of the target that it leaves (root mean square)."""
     size = np.sqrt(np.mean(design**2, axis=0))
@@ -124,8 +129,9 @@ def _carrying(problem: Problem, effects: Sequence[Placed] = ()) -> tuple[ndarray
         values[:, ~finite] = 0.0
         values = np.einsum("tk,ptbm->kbpm", assembled.slope, values, optimize=True)
         rate = nodes.reshape(len(nodes), dynamics.order, dynamics.parts, dynamics.count)[:, -1]
-        # No window holds a gap.
-        whole = record.times[window:] - record.times[:-window] < GAP * window * problem.step
+        # No window holds a gap; where there are only bursts, windows are shorter.
+        while not np.any(whole := _whole(record.times, window, problem.step)) and window > 1:
+            window //= 2
         designs.append(np.empty((int(np.sum(whole)) * rate[0].size, len(values))))
         for column, value in enumerate(values):
             curve = make_interp_spline(record.times, value, k=min(3, len(record.times) - 1))

@@ -30,6 +30,7 @@ from latticebench.diagnosis.progress import Found, Horizon, Tried
 from latticebench.diagnosis.regression import regressed, sustained
 from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
+from latticebench.diagnosis.together import MOST_OF_IT, for_two
 from latticebench.diagnosis.walk_estimate import won_by_walking
 from latticebench.diagnosis.worth import Worth, beyond, displaced, fine, misfits, over, wald
 
@@ -48,8 +49,6 @@ FIRST, CARRIED, CHANGED = 40, 25, 10
 CLIMBING = 2
 # An effect is tried without where its own uncertainty leaves less than so many nats beyond its price.
 DOUBT = 8.0
-# A candidate may take the place of an effect if it can do this share of what the effect does.
-MOST_OF_IT = 0.9
 # A misfit grows with the signal, too: noise is taken to do so only where no more than so many times the noise is left.
 NEAR = 2.0
 # On so few sensors each has a size and a correlation of its own whether or not that is plain.
@@ -130,10 +129,9 @@ class Search:
         """
         if not first:
             return []
-        whole = lengths.longest(self.problem)
+        whole, border = lengths.longest(self.problem), len(self.problem.plain.border) > 0
         ways = [self._begun(self._declared, self.problem, self.layout(whole), CHANGED)]
-        if not len(self.problem.plain.border):
-            ways.append(self._led(first[0], whole))
+        ways += [] if border else [self._led(first[0], whole)]
         found = min((one for one in ways if one is not None), key=lambda one: one.cost, default=None)
         if found is None or not found.converged:
             return []
@@ -145,9 +143,11 @@ class Search:
 
     def _led(self, fitted: Fitted, length: int) -> Fitted | None:
         """Return the fit of a model on pieces of a length, by way of all between; None where the way ends before."""
-        found: Fitted | None = fitted
-        while found is not None and found.longest < length:
-            found = self.carry(found, self.layout(lengths.longer(self.problem, found.longest, settled=False)[0]))
+        found, asked = self.carry(fitted, fitted.layout), fitted.longest
+        # Where there are gaps, pieces are shorter than what is asked for.
+        while found is not None and asked < length:
+            (asked,) = lengths.longer(self.problem, asked, settled=False)
+            found = self.carry(found, self.layout(asked))
         return found
 
     @functools.cached_property
@@ -376,23 +376,24 @@ class Search:
         return white, found
 
     def _exchanged(self, fitted: Fitted, pool: Pool) -> Iterator[Fitted]:
-        """Yield models with a likelier effect in the place of one."""
-        for number, placed in enumerate(fitted.model.effects):
+        """Yield models with a likelier effect in the place of one, or of two that swing together."""
+        effects, every = fitted.model.effects, []
+        for number, placed in enumerate(effects):
             found = [one for one in self.standing_in(fitted, number) if self._rather(one, placed)]
-            for one in found[:2]:
-                model = fitted.model.without(number).with_effect(one.placed)
-                if model not in pool:
-                    cheaper = self.problem.price_of(placed) - self.problem.price_of(one.placed)
-                    hope = fitted.cost + fitted.dispersion * (max(cheaper, 0.0) + displaced(fitted))
-                    other = self.exchanged(fitted, [number], one.placed, hope)
-                    if other is not None:
-                        yield other
+            every += [((number,), one.placed) for one in found[:2]]
+        for numbers, one in (*every, *for_two(self.problem, self.tangent(fitted))):
+            model = functools.reduce(Model.without, sorted(numbers, reverse=True), fitted.model).with_effect(one)
+            if model not in pool:
+                cheaper = sum(self.problem.price_of(effects[k]) for k in numbers) - self.problem.price_of(one)
+                hope = fitted.cost + fitted.dispersion * (max(cheaper, 0.0) + displaced(fitted))
+                other = self.exchanged(fitted, numbers, one, hope)
+                if other is not None:
+                    yield other
 
     def _rather(self, one: Scored, placed: Placed) -> bool:
         """Return whether a candidate is to be tried in the place of an effect."""
-        if one.placed.count < placed.count:
-            return True
-        return one.gain + self.problem.price_of(placed) > 1 + self.problem.price_of(one.placed)
+        more = one.gain + self.problem.price_of(placed) - self.problem.price_of(one.placed)
+        return one.placed.count < placed.count or more > 1
 
     def _sure(self, fitted: Fitted, number: int) -> bool:
         """Return whether an effect is beyond doubt by its numbers and their covariance."""

@@ -253,16 +253,17 @@ def _parts(field: np.ndarray) -> np.ndarray:
 
 def _hum(diagnosis: Diagnosis) -> Iterator[str]:
     """Yield which forces are too fast for the chain to carry them on: only the site's own reading shows them."""
-    own = [one.frequency for one in diagnosis.modes[2]]
+    own, chain = [one.frequency for one in diagnosis.modes[2]], diagnosis.after.chain
     if not own or len(own) == MOST_MODES:
         return
     for found in diagnosis.findings:
         frequency = found.placed.frequency or 0.0
-        texts = {force.text for force in found.placed.forces(diagnosis.after.chain)}
+        texts = {force.text for force in (*found.placed.forces(chain), *found.placed.courses(chain))}
         if texts and texts <= {"1", "i*1"} and frequency > HUM * max(own) > 0:
+            other = "a force on that site" if found.placed.instrument else "hum that a sensor picks up"
             yield (
                 f"The frequency of {found.name} is {frequency / max(own):.2g} times the highest of the chain's own: "
-                "hum that a sensor picks up would look the same. A recording of the chain at rest tells them apart."
+                f"{other} would look the same. A recording of the chain held fast tells them apart."
             )
 
 

@@ -142,7 +142,7 @@ def _lines(report: Report) -> list[tuple[float, str]]:
     return [
         (float(one.parameters["omega"]), one.effect)
         for one in report.effects
-        if "omega" in one.parameters and all(name.endswith(")") for name in one.coefficients)
+        if "omega" in one.parameters and all(name.removesuffix("*i*1").endswith(")") for name in one.coefficients)
     ]
 
 

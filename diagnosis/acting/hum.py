@@ -21,17 +21,20 @@ if TYPE_CHECKING:
 class Hum(OfSensors, Swinging, acts="hum"):
     """The reading is u + a cos(omega s) + b sin(omega s) with s = t - middle, at one sensor or at all alike."""
 
-    separated_by: ClassVar[str] = "a recording of the chain at rest: a sensor hums there, too"
+    separated_by: ClassVar[str] = "a recording of the chain held fast: a sensor hums there, too"
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return every frequency of the scene at every sensor, and at all alike, on a chain of at least two sites.
 
-        A single site that is driven swings as if its sensor hummed.
+        A single site that is driven swings as if its sensor hummed. Beside a site without an equation, a sensor would
+        have what the curve of that site does not follow.
         """
         chain, texts = scene.chain, scene.terms(effect)
         every, still = tuple(range(chain.sites)), (0.0,) * (2 * len(texts))
-        for sites in [*((site,) for site in every), every] if texts and chain.sites > 1 else ():
+        beside = {site + k for site in {*every} - {*chain.moving} for k in range(-chain.reach, chain.reach + 1)}
+        where = [(site,) for site in every if site not in beside]
+        for sites in [*where, *([] if beside else [every])] if texts and chain.sites > 1 else ():
             for omega in scene.frequencies:
                 yield cls(
                     effect=effect, sites=sites, texts=texts, omega=float(omega), middle=scene.middle, strength=still
@@ -67,9 +70,14 @@ class Hum(OfSensors, Swinging, acts="hum"):
     def sentences(self, chain: Chain) -> list[str]:
         """Return how far the reading goes to either side, and how fast it swings."""
         return [
-            f"{self._called(chain)}: {np.linalg.norm(self.strength):.{DIGITS}g} to either side of u, at the angular "
-            f"frequency {self.omega:.{DIGITS}g}"
+            f"{self._called(chain)}: {self.size:.{DIGITS}g} to either side of u, at the angular frequency "
+            f"{self.omega:.{DIGITS}g}"
         ]
+
+    @property
+    def size(self) -> float:
+        """How far the reading goes to either side of u, at most."""
+        return float(np.linalg.norm(np.reshape(self.strength, (2, -1)), 2))
 
     def _called(self, chain: Chain) -> str:
         return "hum of u" + ("" if len(self.sites) == chain.sites else str(self.sites[0] + 1))

@@ -256,6 +256,21 @@ def test_any_two_ways_of_acting_are_told_apart_by_the_same_measurement_in_either
             assert one.separated_from(other) == other.separated_from(one)
 
 
+def test_a_hum_goes_as_far_to_either_side_as_it_says():
+    turning = WAYS["hum"](effect=find("sensor-hum"), sites=(0,), texts=("1", "i*1"), omega=2.0, strength=(1, 0, 0, 1))
+    t = np.linspace(0, 10, 500)
+    added = turning.misread(t, np.zeros((500, 1, 2, 3))).added
+    assert np.max(np.hypot(added[:, 0, 0], added[:, 0, 1])) == pytest.approx(turning.size)
+    assert turning.size == pytest.approx(1.0)
+
+
+def test_no_hum_is_looked_for_beside_sites_without_an_equation():
+    data = recording(False)
+    for ends, sites in (("free", {None, 0, 1, 2, 3, 4}), ("unknown", {2})):
+        problem = Problem.of(REAL[0], 2, [replace(data, ends=ends)], CATALOGUE)
+        assert {one.site for one in problem.candidates if one.effect.name == "sensor-hum"} == sites
+
+
 # From outside ---------------------------------------------------------------------------------------------------------
 
 

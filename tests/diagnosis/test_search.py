@@ -74,6 +74,16 @@ def test_the_declared_equation_is_not_lost_beside_its_best_fit_a_wave_of_a_weak_
     assert found.models[0].model.names == ()
 
 
+def test_readings_in_bursts_have_pieces_shorter_than_what_is_asked_for_and_an_end():
+    """Bursts of twelve readings with gaps of thirty steps between them."""
+    t = np.concatenate([0.2 * np.arange(12) + 8.2 * k for k in range(6)])
+    u = np.outer(np.cos(t), [1.0, 0.9, 1.1]) + 0.02 * np.random.default_rng(1).normal(size=(len(t), 3))
+    data = Samples(t, u, source="bursts", ends="free")
+    catalogue = [one for one in CATALOGUE if one.name in ("damping", "sensor-offset")]
+    found = diagnose(library("chain", "u[n+1]+u[n-1]-2*u[n]; u[n]"), 2, [data], catalogue)
+    assert found.verdict == "nothing missing"
+
+
 @pytest.mark.slow
 def test_a_strong_force_below_the_motions_own_frequency_is_named(driven):
     found = diagnose(SPRING, 2, [driven], CATALOGUE)

@@ -34,6 +34,7 @@ def test_zeros_are_said_in_the_unit_of_the_readings(line: str, expected: str) ->
 def test_the_natural_form_of_a_walk_is_positive_in_that_unit() -> None:
     assert of_natural("walk of u2", MIRRORED) == (1000.0, "mm")
     assert of_natural("offset of u2", MIRRORED) == (-1000.0, "mm")
+    assert of_natural("hum of u2, cos(6.86*(t-5))", MIRRORED) == (-1000.0, "mm")
 
 
 def test_the_noise_says_how_far_a_zero_wanders_over_the_recording_in_that_unit() -> None:

@@ -31,6 +31,15 @@ def said(name: str, site: int | None = None, others: tuple[str, ...] = (), **val
     return Finding(name, site, values, others)
 
 
+def test_the_waves_of_a_hum_are_called_as_those_of_a_drive() -> None:
+    found = called({"hum of u2, cos(6.86*(t-5))": (1.0, 0.1), "hum of u2, sin(6.86*(t-5))": (2.0, 0.1), "omega": (7, 1)})
+    assert found == {"cos": (1.0, 0.1), "sin": (2.0, 0.1), "middle": (5.0, 0.0), "omega": (7, 1)}
+    # Half a turn of phase from t = 0 to t = 5.
+    truth = [there("sensor-hum", 1, cos=-1.0, sin=-2.0, omega=np.pi / 5)]
+    values = {**found, "omega": (np.pi / 5, 0.01)}
+    assert judge(truth, [Finding("sensor-hum", 1, values)]).covered == (3, 3)
+
+
 def test_an_effect_is_named_alone_or_in_its_group() -> None:
     truth = [there("damping"), there("sensor-gain", 1)]
     assert judge(truth, [said("sensor-gain", 1), said("damping")]).right
