@@ -181,6 +181,10 @@ def test_the_page_on_the_diagnosis_says_what_the_table_of_recordings_that_lack_n
     assert every["no answer"] == 0
     for column in ("false alarms", "unexplained"):
         assert f"| {share(every[column], digits=1)} |" in words("diagnosis"), column
+    frame = pd.read_csv(RESULTS / "loop" / "nothing-missing-later" / "laboratory.csv", comment="#")
+    later = nothing_missing(frame).iloc[0]
+    assert later["no answer"] == 1
+    assert f"was named in {share(later['false alarms'], digits=1)}, one more had no answer" in words("diagnosis")
     exact = share(every["false alarms"], digits=1)
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
     assert f"it names something in {exact.split(' (')[0]} of {exact.split()[-1]} " in readme

@@ -32,7 +32,9 @@ def said(name: str, site: int | None = None, others: tuple[str, ...] = (), **val
 
 
 def test_the_waves_of_a_hum_are_called_as_those_of_a_drive() -> None:
-    found = called({"hum of u2, cos(6.86*(t-5))": (1.0, 0.1), "hum of u2, sin(6.86*(t-5))": (2.0, 0.1), "omega": (7, 1)})
+    found = called(
+        {"hum of u2, cos(6.86*(t-5))": (1.0, 0.1), "hum of u2, sin(6.86*(t-5))": (2.0, 0.1), "omega": (7, 1)}
+    )
     assert found == {"cos": (1.0, 0.1), "sin": (2.0, 0.1), "middle": (5.0, 0.0), "omega": (7, 1)}
     # Half a turn of phase from t = 0 to t = 5.
     truth = [there("sensor-hum", 1, cos=-1.0, sin=-2.0, omega=np.pi / 5)]
