@@ -141,9 +141,9 @@ class Search:
         rivals = [one for one in first if one.model.effects]
         return self._laid([found, *rivals], found, whole)
 
-    def _led(self, fitted: Fitted, length: int) -> Fitted | None:
+    def _led(self, found: Fitted | None, length: int) -> Fitted | None:
         """Return the fit of a model on pieces of a length, by way of all between; None where the way ends before."""
-        found, asked = self.carry(fitted, fitted.layout), fitted.longest
+        asked = length if found is None else found.longest
         # Where there are gaps, pieces are shorter than what is asked for.
         while found is not None and asked < length:
             (asked,) = lengths.longer(self.problem, asked, settled=False)

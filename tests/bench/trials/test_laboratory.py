@@ -96,6 +96,19 @@ def test_what_a_recording_cannot_tell_from_an_effect_is_said_beside_it() -> None
     assert gain.alike == ("asymmetric-coupling",)
 
 
+def moved(one: LabRecording, more: Sequence[tuple[float, str]] = ()) -> np.ndarray:
+    """Return the first sixty positions by the declared terms and some more, each a coefficient and a text."""
+    pieces = [*zip(one.coefficients.tolist(), one.declared.texts, strict=True), *more]
+    term = Term(" + ".join(f"({size!r})*({text})" for size, text in pieces))
+    motion = Motion(term, 2, is_complex=False, sites=one.chain.sites, ends=one.chain.ends)
+    times = one.samples.t[:60]
+    exact = scipy.integrate.solve_ivp(
+        motion.right_hand_side, (0.0, times[-1]), motion.pack(*one.chain.start), t_eval=times, method="LSODA",
+        rtol=1e-10, atol=1e-10 * one.chain.size,
+    )  # fmt: skip
+    return np.asarray(motion.unpack(exact.y)[0])
+
+
 @pytest.mark.parametrize(
     "names",
     [
@@ -106,35 +119,16 @@ def test_what_a_recording_cannot_tell_from_an_effect_is_said_beside_it() -> None
 )
 def test_a_recording_moves_by_the_formulas_of_its_effects_in_the_catalogue(names: list[str]) -> None:
     one = make_recording(2, "white", names, sites=4)
-    pieces = list(zip(one.coefficients.tolist(), one.declared.texts, strict=True))
-    pieces += [(float(each.parameters["coefficient"]), find(each.name).formula) for each in one.effects]
-    term = Term(" + ".join(f"({size!r})*({text})" for size, text in pieces))
-    motion = Motion(term, 2, is_complex=False, sites=4, ends=one.chain.ends)
-    rows = slice(0, 60)
-    times = one.samples.t[rows]
-    exact = scipy.integrate.solve_ivp(
-        motion.right_hand_side, (0.0, times[-1]), motion.pack(*one.chain.start), t_eval=times, method="LSODA",
-        rtol=1e-10, atol=1e-10 * one.chain.size,
-    )  # fmt: skip
-    np.testing.assert_allclose(motion.unpack(exact.y)[0], one.clean[rows], rtol=0, atol=1e-6 * one.chain.size)
+    more = [(float(each.parameters["coefficient"]), find(each.name).formula) for each in one.effects]
+    np.testing.assert_allclose(moved(one, more), one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
 
 
 def test_the_hum_of_a_sensor_is_in_its_readings_and_does_not_move_the_chain() -> None:
     one = make_recording(4, "white", [effects.HUM], sites=3)
     (hum,) = one.effects
     assert hum.site is not None
-    motion = Motion(
-        Term(" + ".join(f"({size!r})*({text})" for size, text in zip(
-            one.coefficients.tolist(), one.declared.texts, strict=True
-        ))), 2, is_complex=False, sites=3, ends=one.chain.ends,
-    )  # fmt: skip
-    times = one.samples.t[:60]
-    exact = scipy.integrate.solve_ivp(
-        motion.right_hand_side, (0.0, times[-1]), motion.pack(*one.chain.start), t_eval=times, method="LSODA",
-        rtol=1e-10, atol=1e-10 * one.chain.size,
-    )  # fmt: skip
-    expected = motion.unpack(exact.y)[0]
-    phase = hum.parameters["omega"] * times
+    expected = moved(one)
+    phase = hum.parameters["omega"] * one.samples.t[:60]
     expected[:, hum.site] += hum.parameters["cos"] * np.cos(phase) + hum.parameters["sin"] * np.sin(phase)
     np.testing.assert_allclose(expected, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
 
@@ -144,17 +138,7 @@ def test_a_curve_of_one_sensor_bends_its_readings_and_no_others() -> None:
     (bent,) = one.effects
     assert bent.name == "sensor-curve"
     assert bent.site is not None
-    pairs = zip(one.coefficients.tolist(), one.declared.texts, strict=True)
-    motion = Motion(
-        Term(" + ".join(f"({size!r})*({text})" for size, text in pairs)), 2, is_complex=False, sites=2,
-        ends=one.chain.ends,
-    )  # fmt: skip
-    times = one.samples.t[:60]
-    exact = scipy.integrate.solve_ivp(
-        motion.right_hand_side, (0.0, times[-1]), motion.pack(*one.chain.start), t_eval=times, method="LSODA",
-        rtol=1e-10, atol=1e-10 * one.chain.size,
-    )  # fmt: skip
-    expected = motion.unpack(exact.y)[0]
+    expected = moved(one)
     expected[:, bent.site] += bent.parameters[f"curve_{bent.site + 1}"] * expected[:, bent.site] ** 2
     np.testing.assert_allclose(expected, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
 
