@@ -27,7 +27,7 @@ import numpy as np
 from latticebench.bench.noise import left_by, of_sensors
 from latticebench.bench.overlay import motion_of
 from latticebench.diagnosis.instrument import two_digits
-from latticebench.diagnosis.problem import Spectrum
+from latticebench.diagnosis.spectrum import Spectrum
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.engine.derivatives import DEGREE, differentiate
 from latticebench.methods.engine.dynamics import Dynamics, split_parts

@@ -14,7 +14,7 @@ import numpy as np
 from latticebench.bench.noise import centred
 from latticebench.bench.report.notes import at_ends, degrees, resting, strays, turns
 from latticebench.diagnosis.instrument import of_readings, step_of
-from latticebench.diagnosis.problem import Spectrum
+from latticebench.diagnosis.spectrum import Spectrum
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.systems.lattice import Library
 from latticebench.systems.samples import Samples

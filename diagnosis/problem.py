@@ -13,6 +13,7 @@ import numpy as np
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain, Placed, Scene, way_of
 from latticebench.diagnosis.instrument import of_readings, quietest, step_of
+from latticebench.diagnosis.spectrum import Spectrum, alias, lines
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.engine.derivatives import DEGREE, differentiate
 from latticebench.methods.engine.dynamics import Dynamics, Factor, split_parts
@@ -37,8 +38,6 @@ MARGIN = 40
 # Degrees of the splines that an input may follow between its samples: held, as a converter does, in straight lines, or
 # smoothly. At three samples a period, a tenth of a wave is lost by the cubic spline, a hundredth by the last.
 DEGREES = (0, 1, 3, 7)
-# A peak of the spectrum is motion where it stands so many times above the noise, and has this share of the largest.
-ABOVE, SHARE = 30.0, 3e-3
 # Outside influences are looked for up to so many times the highest frequency, at so many frequencies at most.
 FARTHER, MOST_FREQUENCIES = 6.0, 900
 # Noise is at least this share of the swing: no instrument shows less, and motions are not computed more accurately.
@@ -47,80 +46,11 @@ FINEST = 1e-6
 GAP = 2.0
 # In typical times between readings; each is some steps of the integrator.
 LONGEST_GAP = 1000.0
-# A gap of a sensor is interpolated where it has at most so many usual steps, or lasts half a period at most.
-HOLE = 8.0
-# The spectrum's grid has at most so many times, or four for each reading if that is more.
-MOST_GRID = 2**20
 # Dry friction is viscous at first below this share of the usual speed: a fit that is far from the motion needs forces
 # without jumps.
 AT_REST = 0.1
 # So many sensors are looked at for steps before it is taken that there are none.
 FEW_SENSORS = 4
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """The mean power spectrum of all sensors.
-
-    Attributes:
-        omega: angular frequencies.
-        power: relative.
-        peaks: frequencies of the peaks that are motion, the strongest first.
-    """
-
-    omega: Float[ndarray, " frequencies"]
-    power: Float[ndarray, " frequencies"]
-    peaks: Float[ndarray, " peaks"]
-
-    @classmethod
-    def of(cls, samples: Samples) -> Spectrum:
-        """Return the spectrum of a recording; missing and uneven readings are interpolated.
-
-        A sensor's gap in which it swings is not: a line through it is a slow motion that nobody has seen. The spectrum
-        is the sum of those of the longest stretches between such gaps.
-        """
-        few = HOLE * float(np.median(np.diff(samples.t)))
-        omega, total = _power(samples, few)
-        half = np.pi / float(omega[1 + np.argmax(total[1:])])
-        if half > few:
-            omega, total = _power(samples, half)
-        floor = float(np.median(total[len(total) // 2 :]))
-        inner = (total[1:-1] >= total[:-2]) & (total[1:-1] > total[2:])
-        peaks = np.flatnonzero(inner) + 1
-        tall = peaks[total[peaks] > max(ABOVE * floor, SHARE * float(np.max(total)))]
-        return cls(omega, total, omega[tall[np.argsort(-total[tall])]])
-
-    def between(self, peak: float) -> float:
-        """Return the frequency of a peak by the parabola through the logarithms of the power beside it."""
-        k = int(np.searchsorted(self.omega, peak))
-        low, high, beyond = np.log(self.power[k - 1 : k + 2])
-        return float(peak + (self.omega[1] - self.omega[0]) * (low - beyond) / (2 * (low - 2 * high + beyond)))
-
-
-def _power(samples: Samples, gap: float) -> tuple[Float[ndarray, " frequencies"], Float[ndarray, " frequencies"]]:
-    """Return angular frequencies, and the mean power at them of the sensors' stretches without a longer gap."""
-    sensors = []
-    for column in split_parts(samples.u, samples.is_complex).reshape(len(samples.t), -1).T:
-        rows = np.flatnonzero(np.isfinite(column))
-        parts = np.split(rows, np.flatnonzero(np.diff(samples.t[rows]) > gap) + 1)
-        longest = max(map(len, parts))
-        # The lines of much shorter ones are too broad beside those of the longest.
-        sensors.append([(samples.t[part], column[part]) for part in parts if len(part) >= max(4, longest / 2)])
-    step = float(np.median(np.diff(samples.t)))
-    lasting = float(max((t[-1] - t[0] for one in sensors for t, _ in one), default=samples.t[-1] - samples.t[0]))
-    # Many shorter gaps, too, must not make a grid that no memory holds.
-    step = max(step, lasting / max(MOST_GRID, 4 * len(samples.t)))
-    size = 4 * len(np.arange(0, lasting + step / 2, step))
-    omega = 2 * np.pi * np.fft.rfftfreq(size, step)
-    total = np.zeros(len(omega))
-    for stretches in filter(None, sensors):
-        mean = np.mean(np.concatenate([values for _, values in stretches]))
-        power = np.zeros(len(omega))
-        for t, values in stretches:
-            even = np.interp(np.arange(t[0], t[-1] + step / 2, step), t, values) - mean
-            power += np.abs(np.fft.rfft(even * np.hanning(len(even)), size)) ** 2
-        total += power / max(float(np.sum(power)), 1e-300)
-    return omega, total
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +103,8 @@ class Problem:
         longest = max(data, key=lambda one: len(one.t))
         spectrum = Spectrum.of(longest)
         top = _top(spectrum, longest)
-        parts = [(part, one) for one in data for part in windows(thinned(one, top))]
+        fast = lines(longest, FARTHER * top)
+        parts = [(part, one) for one in data for part in windows(thinned(one, top, fast))]
         data, forced = tuple(part for part, _ in parts), tuple(around(*pair) for pair in parts)
         longest = max(data, key=lambda one: len(one.t))
         first = data[0]
@@ -202,6 +133,7 @@ class Problem:
             (float(min(one.t[0] for one in data)), float(max(one.t[-1] for one in data))),
             top,
             _frequencies(top, span, step),
+            _beside(fast, FARTHER * top, span),
             past,
             declared.texts,
             first.f is not None,
@@ -351,10 +283,11 @@ def _check_gaps(data: Sequence[Samples]) -> None:
             )
 
 
-def thinned(samples: Samples, top: float) -> Samples:
+def thinned(samples: Samples, top: float, fast: Float[ndarray, " lines"]) -> Samples:
     """Return every k-th sample of one that is read far more often than it moves, and at least `LONG` / 2 of them.
 
     Beside an input k is a power of two, so that steps of an integrator, which are halved, end where its samples are.
+    Elsewhere it is such that no fast line looks like a slow one, if one of the largest half of all k is.
     """
     step = float(np.median(np.diff(samples.t)))
     stride = min(int(2 * np.pi / top / step / DENSE), len(samples.t) // (LONG // 2))
@@ -362,6 +295,9 @@ def thinned(samples: Samples, top: float) -> Samples:
         return samples
     if samples.f is not None:
         stride = 1 << (stride.bit_length() - 1)
+    else:
+        strides = range(stride, stride // 2, -1)
+        stride = next((k for k in strides if np.all(alias(fast, k * step) > FARTHER * top)), stride)
     f = None if samples.f is None else samples.f[::stride]
     u, v = samples.u[::stride], None if samples.v is None else samples.v[::stride]
     return replace(samples, t=samples.t[::stride], u=u, v=v, f=f)
@@ -451,6 +387,13 @@ def _frequencies(top: float, span: float, step: float) -> Float[ndarray, " frequ
     highest = min(0.9 * np.pi / step, FARTHER * top)
     every = np.arange(1.0, highest * span / np.pi) * np.pi / span
     return every[:: len(every) // MOST_FREQUENCIES + 1]
+
+
+def _beside(fast: Float[ndarray, " lines"], above: float, span: float) -> Float[ndarray, " frequencies"]:
+    """Return frequencies half a resolution apart about fast lines, as far as a line is compared with others."""
+    steps = np.round(fast * span / np.pi)[:, None] + np.arange(-rules.AROUND, rules.AROUND + 1)
+    every = np.unique(steps) * np.pi / span
+    return np.asarray(every[every > above])
 
 
 def turned(problem: Problem, site: int) -> Problem:

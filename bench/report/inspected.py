@@ -13,7 +13,7 @@ from latticebench.bench.inspection import Inspection
 from latticebench.bench.plots import in_decades
 from latticebench.bench.report.rows import Table
 from latticebench.bench.report.units import axis, rate_of, with_unit
-from latticebench.diagnosis.problem import Spectrum
+from latticebench.diagnosis.spectrum import Spectrum
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.systems.samples import Samples
 

@@ -275,7 +275,8 @@ class Sight:
         every = np.arange(1.0, 3 * top * span / np.pi) * np.pi / span
         texts = tuple(term.text for term in self.dynamics.terms)
         field = self.dynamics.whole(line.nodes, None)[:, 0]
-        return Scene(chain, begin, span, (begin, begin + span), top, every, (_past(self.times, field),), texts, False)
+        past = (_past(self.times, field),)
+        return Scene(chain, begin, span, (begin, begin + span), top, every, np.empty(0), past, texts, False)
 
 
 def _past(times: ndarray, field: Float[ndarray, "time parts sites"]) -> Factor:

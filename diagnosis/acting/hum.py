@@ -25,7 +25,7 @@ class Hum(OfSensors, Swinging, acts="hum"):
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every frequency of the scene at every sensor, and at all alike, on a chain of at least two sites.
+        """Return every frequency of the scene, fast ones too, at every sensor and at all alike, on two sites or more.
 
         A single site that is driven swings as if its sensor hummed. Beside a site without an equation, a sensor would
         have what the curve of that site does not follow.
@@ -35,7 +35,7 @@ class Hum(OfSensors, Swinging, acts="hum"):
         beside = {site + k for site in {*every} - {*chain.moving} for k in range(-chain.reach, chain.reach + 1)}
         where = [(site,) for site in every if site not in beside]
         for sites in [*where, *([] if beside else [every])] if texts and chain.sites > 1 else ():
-            for omega in scene.frequencies:
+            for omega in (*scene.frequencies, *scene.fast):
                 yield cls(
                     effect=effect, sites=sites, texts=texts, omega=float(omega), middle=scene.middle, strength=still
                 )  # fmt: skip

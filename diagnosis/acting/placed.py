@@ -80,6 +80,7 @@ class Scene:
         seen: the first and the last time of all recordings.
         top: the highest angular frequency that the readings plainly show.
         frequencies: angular frequencies that an outside influence may have.
+        fast: angular frequencies beyond these, about lines that sensors show: too fast for what moves a chain.
         past: the smoothed field of each recording as a function of times, (B,) -> (parts, B, N).
         texts: the declared terms.
         inputs: whether an input was measured.
@@ -91,6 +92,7 @@ class Scene:
     seen: tuple[float, float]
     top: float
     frequencies: Float[ndarray, " frequencies"]
+    fast: Float[ndarray, " frequencies"]
     past: tuple[Factor, ...]
     texts: tuple[str, ...]
     inputs: bool

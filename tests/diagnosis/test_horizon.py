@@ -15,8 +15,9 @@ from latticebench.diagnosis.fitting import fit
 from latticebench.diagnosis.horizon import Layout, follow, unread
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
-from latticebench.diagnosis.problem import LONG, WINDOWS, Problem, thinned, windows
+from latticebench.diagnosis.problem import FARTHER, LONG, WINDOWS, Problem, thinned, windows
 from latticebench.diagnosis.regression import regressed
+from latticebench.diagnosis.spectrum import alias
 from latticebench.diagnosis.worth import Worth, misfits
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.lattice import library
@@ -210,13 +211,24 @@ def test_the_declared_coefficients_to_start_from_are_near_those_that_made_the_da
 def test_a_long_recording_is_used_thinned_and_in_windows():
     t = np.linspace(0, 4000, 200_000)
     samples = Samples(t, np.sin(t)[:, None], source="long", ends="free")
-    thin = thinned(samples, 1.0)
+    thin = thinned(samples, 1.0, np.empty(0))
     assert len(thin.t) < len(t)
     assert np.all(np.isin(thin.t, t))
     parts = windows(thin)
     assert len(parts) == WINDOWS
     assert sum(len(one.t) for one in parts) <= LONG
     assert all(one.t[-1] < other.t[0] for one, other in itertools.pairwise(parts))
+
+
+def test_a_line_that_is_too_fast_for_the_motion_does_not_look_like_one_of_it_where_a_recording_is_thinned():
+    t = np.arange(40_000) * 0.01
+    samples = Samples(t, np.sin(t)[:, None], source="long", ends="free")
+    usual = thinned(samples, 1.0, np.empty(0)).t[1]
+    # With the usual step this one would be read as a wave of twice the frequency of the motion.
+    fast = 2 * np.pi / usual + 2.0
+    step = thinned(samples, 1.0, np.array([fast])).t[1]
+    assert usual / 2 < step < usual
+    assert alias(np.array([fast]), step) > FARTHER
 
 
 @pytest.mark.parametrize("middle", [0.0, 0.3, 1.0])

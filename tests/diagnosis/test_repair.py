@@ -36,7 +36,7 @@ class Lab:
         return f"{self.sites} sites-{'+'.join(self.effects) or 'nothing'}-{self.instrument}-{self.seed}"
 
 
-NONE, SPIKES = Lab(102, 2, (), "white"), Lab(102, 3, (), "spikes")
+NONE, SPIKES, DENSE = Lab(102, 2, (), "white"), Lab(102, 3, (), "spikes"), Lab(103, 2, (), "white")
 OFFSET = Lab(102, 2, ("sensor-offset",), "white")
 STIFFENING = Lab(103, 1, ("onsite-cubic", "damping"), "heavy-tailed")
 DRAG = Lab(103, 1, ("quadratic-drag",), "white")
@@ -112,17 +112,18 @@ def test_a_zero_that_wanders_is_named_with_its_sensor_and_how_far_it_goes_and_le
     assert found.forecast[1] <= found.forecast[0]
 
 
-def humming(sensors):
-    """A recording of two sites with a hum of six times the noise, what is found in it, and size and frequency."""
-    recording = made(NONE)
-    read, size, omega = recording.samples, 6 * recording.noise[1], 0.7 * recording.chain.fast
+def humming(sensors, lab=NONE, fast=0.7, times=6):
+    """A recording of two sites with a hum of so many times the noise, what is found in it, and size and frequency."""
+    recording = made(lab)
+    read, size, omega = recording.samples, times * recording.noise[1], fast * recording.chain.fast
     here = np.isin(np.arange(read.sites), sensors)
     found = diagnosed_as(recording, replace(read, u=read.u + np.outer(size * np.cos(omega * read.t), here)))
     return recording, found, size, omega
 
 
-def test_a_hum_of_one_sensor_is_named_with_its_size_and_its_frequency_and_can_be_taken_away():
-    recording, found, size, omega = humming([1])
+@pytest.mark.parametrize("hum", [(NONE, 0.7, 6), pytest.param((DENSE, 13.3, 1.5), id="too fast for a force")])
+def test_a_hum_of_one_sensor_is_named_with_its_size_and_its_frequency_and_can_be_taken_away(hum):
+    recording, found, size, omega = humming([1], *hum)
     (one,) = found.findings
     assert (one.name, one.site, found.verdict) == ("sensor-hum", 1, "explained")
     value, error = one.values["omega"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.diagnosis.problem import Spectrum
+from latticebench.diagnosis.spectrum import Spectrum, alias, lines
 from latticebench.systems.samples import Samples
 
 # Cycles per unit of time, and times at which both sensors are read: 50 and 38 cycles, 20 readings in the shorter.
@@ -56,3 +56,36 @@ def test_readings_missing_here_and_there_leave_the_lines_where_they_are(share: f
 def test_a_sensor_without_readings_does_not_count() -> None:
     silent = gaps((0, len(TIMES)))
     assert cycles(silent) == pytest.approx(sorted(LINES), abs=0.02)
+
+
+def many(*hums: tuple[int, float]) -> Samples:
+    """Eighteen sensors of one motion of one cycle per unit of time, of which some hum with these cycles."""
+    rng, times = np.random.default_rng(6), np.arange(3000) * 0.02
+    u = np.cos(2 * np.pi * times)[:, None] * rng.normal(size=18) + 0.01 * rng.standard_t(4, size=(3000, 18))
+    for sensor, line in hums:
+        u[:, sensor] += 0.01 * np.sin(2 * np.pi * line * times)
+    return Samples(times, u)
+
+
+def test_a_line_of_the_size_of_the_noise_is_found_where_one_of_many_sensors_hums() -> None:
+    found = lines(many((3, 16.67), (11, 21.3)), 12 * np.pi) / (2 * np.pi)
+    assert found == pytest.approx([16.67, 21.3], abs=0.01)
+
+
+def test_noise_and_the_slope_of_a_strong_motion_are_no_lines() -> None:
+    assert len(lines(many(), 12 * np.pi)) == 0
+    times = np.arange(3000) * 0.02
+    # Without noise there is nothing but what a finite record makes of the motion.
+    assert len(lines(Samples(times, np.exp(-0.05 * times)[:, None] * np.cos(6.1 * times)[:, None]), 12 * np.pi)) == 0
+
+
+def test_beyond_half_the_rate_of_reading_nothing_is_looked_for() -> None:
+    assert len(lines(many((3, 16.67)), 51 * np.pi)) == 0
+
+
+@pytest.mark.parametrize("omega", [0.3, 3.1, 3.2, 9.0, 40.0])
+def test_a_wave_that_is_read_too_seldom_looks_like_its_alias(omega: float) -> None:
+    times = np.arange(50) * 1.0
+    (seen,) = alias(np.array([omega]), 1.0)
+    assert 0 <= seen <= np.pi
+    np.testing.assert_allclose(np.cos(seen * times), np.cos(omega * times), atol=1e-9)
