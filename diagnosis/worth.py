@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -103,6 +103,42 @@ def displaced(fitted: Fitted) -> float:
     return rules.DISPLACED * float(np.log1p(max(distances[0] - distances[1], 0.0) ** 2))
 
 
+@functools.lru_cache(maxsize=64)
+def pushed(fitted: Fitted) -> float:
+    """Return the nats that forces with a frequency or a time of their own cost which push harder than all else.
+
+    Each costs ln(1 + d^2), with d its root mean square beside that of all terms that are no such forces, at the sites
+    where it acts.
+    """
+    effects = fitted.model.effects
+    own = [one for one in effects if one.timed and not one.instrument]
+    if not own:
+        return 0.0
+    plain = replace(fitted.model, effects=tuple(one for one in effects if one not in own))
+    rest, found = _rates(fitted, plain), 0.0
+    for one in own:
+        push = _rates(fitted, plain.with_effect(one)) - rest
+        acts = np.any(push != 0, axis=0)
+        size = float(np.sum(rest[:, acts] ** 2))
+        # A force on what nothing else moves is as likely as one that is as strong as all else.
+        found += float(np.log1p(np.sum(push[:, acts] ** 2) / size if size > 0 else 1.0))
+    return rules.PUSHED * found
+
+
+def _rates(fitted: Fitted, model: Model) -> Float[ndarray, "rows channels"]:
+    """Return the highest time derivatives that a model gives along a fitted motion, of all recordings."""
+    layout, rates = fitted.layout, []
+    for number, record in enumerate(layout.records):
+        assembled = model.assembled(layout.plain, layout.chain, number)
+        t = record.times[layout.rows[number]].ravel()
+        states = fitted.followed.nodes[number].reshape(len(t), -1)
+        inputs = None if record.stretches.inputs is None else record.stretches.inputs(t)
+        driven = layout.driven(number, fitted.followed.splines[number])
+        rate = assembled.dynamics.linear(assembled.coefficients, t, states, inputs, driven, derivatives=False)[0]
+        rates.append(rate.reshape(len(t), layout.plain.order, -1)[layout.valid[number].ravel(), -1])
+    return np.concatenate(rates)
+
+
 def wald(fitted: Fitted, number: int) -> float:
     """Return the nats that an effect brings as far as the model is linear: half of Wald's statistic.
 
@@ -164,7 +200,7 @@ class Worth:
         effects = zip(fitted.model.effects, crowdings(self.problem, fitted), strict=True)
         misfit = 1.0 if self.best is None else self.best.dispersion
         prices = sum(self.price_of(one) * max(1.0, many / misfit) for one, many in effects)
-        return prices + float(noise) + repelling(self.problem, fitted.model) + displaced(fitted)
+        return prices + float(noise) + repelling(self.problem, fitted.model) + displaced(fitted) + pushed(fitted)
 
     def value(self, fitted: Fitted) -> float:
         """Return the cost of a fit, as much less as the best one misfits, and its price, in nats."""
