@@ -32,7 +32,7 @@ from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.together import MOST_OF_IT, for_two
 from latticebench.diagnosis.walk_estimate import won_by_walking
-from latticebench.diagnosis.worth import Worth, beyond, displaced, fine, misfits, over, wald
+from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, unlikely, wald
 
 Watcher = Callable[[str], None]
 
@@ -320,7 +320,7 @@ class Search:
         model = fitted.model
         for number in range(len(model.effects)):
             if model.without(number) not in pool and not self._sure(fitted, number):
-                hope = fitted.cost + fitted.dispersion * (own.price_of(model.effects[number]) + displaced(fitted))
+                hope = fitted.cost + fitted.dispersion * (own.price_of(model.effects[number]) + unlikely(fitted))
                 found = self.without(fitted, number, hope)
                 if found is not None:
                     yield found
@@ -385,7 +385,7 @@ class Search:
             model = functools.reduce(Model.without, sorted(numbers, reverse=True), fitted.model).with_effect(one)
             if model not in pool:
                 cheaper = sum(self.problem.price_of(effects[k]) for k in numbers) - self.problem.price_of(one)
-                hope = fitted.cost + fitted.dispersion * (max(cheaper, 0.0) + displaced(fitted))
+                hope = fitted.cost + fitted.dispersion * (max(cheaper, 0.0) + unlikely(fitted))
                 other = self.exchanged(fitted, numbers, one, hope)
                 if other is not None:
                     yield other

@@ -125,6 +125,11 @@ def pushed(fitted: Fitted) -> float:
     return rules.PUSHED * found
 
 
+def unlikely(fitted: Fitted) -> float:
+    """Return the nats that a model costs for how far its motion is from its zero, and how hard its forces push."""
+    return displaced(fitted) + pushed(fitted)
+
+
 def _rates(fitted: Fitted, model: Model) -> Float[ndarray, "rows channels"]:
     """Return the highest time derivatives that a model gives along a fitted motion, of all recordings."""
     layout, rates = fitted.layout, []
@@ -200,7 +205,7 @@ class Worth:
         effects = zip(fitted.model.effects, crowdings(self.problem, fitted), strict=True)
         misfit = 1.0 if self.best is None else self.best.dispersion
         prices = sum(self.price_of(one) * max(1.0, many / misfit) for one, many in effects)
-        return prices + float(noise) + repelling(self.problem, fitted.model) + displaced(fitted) + pushed(fitted)
+        return prices + float(noise) + repelling(self.problem, fitted.model) + unlikely(fitted)
 
     def value(self, fitted: Fitted) -> float:
         """Return the cost of a fit, as much less as the best one misfits, and its price, in nats."""

@@ -58,7 +58,7 @@ KINDS_OF_RECORDINGS = {
     "nothing": "such recordings with nothing missing: nothing is named, and the verdict is not `unexplained`",
     "wandering": "laboratory recordings of one to three sites, one of whose zeros drifts or wanders: as missing",
     "bent": "laboratory recordings of two sites that rub, with a gain, offsets and a curve of one sensor: as missing",
-    "humming": "laboratory recordings of two sites with damping, one of whose sensors hums: as missing",
+    "mains": "laboratory recordings of two sites with damping, one of whose sensors has mains in its cable: as missing",
     "unnamed": "short recordings of 25 sites with an effect that has no name: the verdict says that something is left",
     "relaxing": "short recordings of a Ginzburg-Landau lattice of 25 sites, one effect missing: it alone is named",
     "measured": "measured recordings: the effects that are known to be there are named, and the forecast is not worse",
@@ -71,11 +71,11 @@ SEEDS = {
     "relaxing": (34001, 34002),
     "wandering": range(35000, 35018),
     "bent": range(36000, 36016),
-    "humming": range(38000, 38016),
+    "mains": range(39000, 39016),
 }
 SITES = (1, 2, 3)
-# What is missing where a sensor is bent, and where one hums.
-BENT, HUMMING = "own-sensor-curve+sensor-gain+sensor-offset+dry-friction", "sensor-hum+damping"
+# What is missing where a sensor is bent, and where one has mains.
+BENT, MAINS = "own-sensor-curve+sensor-gain+sensor-offset+dry-friction", "mains+damping"
 # Of so many laboratory recordings in a row so many are kept: those that take least time.
 OF, KEPT = 5, 3
 # Of the fifth blind set's effects every so many is taken.
@@ -119,7 +119,7 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
         ("wandering", str(seed), Laboratory(seed=seed, sites=SITES[place % len(SITES)], instrument="drifting-zero"))
         for place, seed in enumerate(SEEDS["wandering"])
     ]
-    for kind, effects in (("bent", BENT), ("humming", HUMMING)):
+    for kind, effects in (("bent", BENT), ("mains", MAINS)):
         found += [(kind, str(seed), Laboratory(seed=seed, sites=2, effects=effects)) for seed in SEEDS[kind]]
     for seed in SEEDS["unnamed"]:
         trials = [(name, Trial(system="phi4", effect=name, z=30.0, seed=seed)) for name in [*FIFTH_BLIND][::EVERY]]
@@ -136,7 +136,7 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
 
 def judged(kind: str, name: str, result: Mapping[str, Any]) -> dict[str, Any]:
     """Return the verdict, what was named, and whether that is right."""
-    if kind in ("missing", "nothing", "wandering", "bent", "humming"):
+    if kind in ("missing", "nothing", "wandering", "bent", "mains"):
         row = laboratory.table([result]).iloc[0]
         right = row["right"] and not (kind == "nothing" and row["verdict"] == "unexplained")
         return {"truth": row["truth"], "verdict": row["verdict"], "named": row["named"], "right": right}

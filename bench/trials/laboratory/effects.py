@@ -28,6 +28,8 @@ LOCAL = (LOCAL_DRIVE, LOCAL_DAMPING, BOND)
 OWN_CURVE = "own-sensor-curve"
 # A sensor that hums, likewise; as fast as to be read so many times in half a period at least.
 HUM, PER_HALF = "sensor-hum", 1.25
+# A hum that is at least so many times as fast as the chain, where it is read so often; put in where it is asked for.
+MAINS, FASTER = "mains", 6.0
 # Of Fermi, Pasta and Ulam, and of van der Pol; put in where they are asked for.
 LOSS = "nonlinear-damping"
 CLASSIC = ("quadratic-coupling", LOSS)
@@ -42,7 +44,7 @@ NAMES = (
 )  # fmt: skip
 # How often each is drawn, where 1 is not given: what most recordings have.
 OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
-ASKED = (*NAMES, *LOCAL, OWN_CURVE, HUM, *CLASSIC)
+ASKED = (*NAMES, *LOCAL, OWN_CURVE, HUM, MAINS, *CLASSIC)
 """Every effect that can be asked for."""
 HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
 """Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
@@ -116,7 +118,7 @@ def sensible(chain: Chain, reach: int, names: Sequence[str] = NAMES) -> list[str
     for name in names:
         if DECLARED.get(name) in chain.declared:
             continue
-        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM) and inner < 2:
+        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM, MAINS) and inner < 2:
             continue
         if name == BOND and not (chain.coupled and inner > 2):
             continue
@@ -144,12 +146,15 @@ def draw_ingredient(name: str, chain: Chain, reach: int, draw: np.random.Generat
         return _offset(chain, inner, draw)
     if name == GAIN:
         return _gain(chain, inner, draw)
-    if name == HUM:
+    if name in (HUM, MAINS):
         phase = draw.uniform(0, 2 * np.pi)
-        highest = min(4 * chain.fast, np.pi / PER_HALF * (chain.readings - 1) / chain.span)
-        omega = np.exp(draw.uniform(np.log(0.3 * chain.slow), np.log(highest)))
+        read = np.pi / PER_HALF * (chain.readings - 1) / chain.span
+        lowest, highest = 0.3 * chain.slow, min(4 * chain.fast, read)
+        if name == MAINS:
+            lowest, highest = min(FASTER * chain.fast, read / 2), read
+        omega = np.exp(draw.uniform(np.log(lowest), np.log(highest)))
         waves = {"cos": chain.size * np.cos(phase), "sin": chain.size * np.sin(phase)}
-        return Ingredient(name, site, waves, 0.5, {"omega": float(omega)})
+        return Ingredient(HUM, site, waves, 0.5, {"omega": float(omega)})
     if name in (DRIVE, LOCAL_DRIVE):
         phase = draw.uniform(0, 2 * np.pi)
         force = chain.slow**2 * chain.size

@@ -123,10 +123,15 @@ def test_a_recording_moves_by_the_formulas_of_its_effects_in_the_catalogue(names
     np.testing.assert_allclose(moved(one, more), one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
 
 
-def test_the_hum_of_a_sensor_is_in_its_readings_and_does_not_move_the_chain() -> None:
-    one = make_recording(4, "white", [effects.HUM], sites=3)
+@pytest.mark.parametrize("name", [effects.HUM, effects.MAINS])
+def test_the_hum_of_a_sensor_is_in_its_readings_and_does_not_move_the_chain(name: str) -> None:
+    one = make_recording(4, "white", [name], sites=3)
     (hum,) = one.effects
     assert hum.site is not None
+    highest = (1 / effects.PER_HALF) * np.pi / np.median(np.diff(one.samples.t))
+    assert hum.name == effects.HUM
+    assert (hum.parameters["omega"] > 4 * one.chain.fast) == (name == effects.MAINS)
+    assert hum.parameters["omega"] < 1.01 * highest
     expected = moved(one)
     phase = hum.parameters["omega"] * one.samples.t[:60]
     expected[:, hum.site] += hum.parameters["cos"] * np.cos(phase) + hum.parameters["sin"] * np.sin(phase)
