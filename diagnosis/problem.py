@@ -13,7 +13,7 @@ import numpy as np
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain, Placed, Scene, way_of
 from latticebench.diagnosis.instrument import of_readings, quietest, step_of
-from latticebench.diagnosis.spectrum import Spectrum, alias, lines
+from latticebench.diagnosis.spectrum import Spectrum, hidden, lines, mean_step
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.engine.derivatives import DEGREE, differentiate
 from latticebench.methods.engine.dynamics import Dynamics, Factor, split_parts
@@ -103,7 +103,7 @@ class Problem:
         longest = max(data, key=lambda one: len(one.t))
         spectrum = Spectrum.of(longest)
         top = _top(spectrum, longest)
-        fast = lines(longest, FARTHER * top)
+        fast = np.unique(np.concatenate([lines(one, FARTHER * top) for one in data]))
         parts = [(part, one) for one in data for part in windows(thinned(one, top, fast))]
         data, forced = tuple(part for part, _ in parts), tuple(around(*pair) for pair in parts)
         longest = max(data, key=lambda one: len(one.t))
@@ -287,17 +287,15 @@ def thinned(samples: Samples, top: float, fast: Float[ndarray, " lines"]) -> Sam
     """Return every k-th sample of one that is read far more often than it moves, and at least `LONG` / 2 of them.
 
     Beside an input k is a power of two, so that steps of an integrator, which are halved, end where its samples are.
-    Elsewhere it is such that no fast line looks like a slow one, if one of the largest half of all k is.
+    It is the largest with which the fewest fast lines look like slow ones or like one another.
     """
-    step = float(np.median(np.diff(samples.t)))
-    stride = min(int(2 * np.pi / top / step / DENSE), len(samples.t) // (LONG // 2))
+    usual = float(np.median(np.diff(samples.t)))
+    stride = min(int(2 * np.pi / top / usual / DENSE), len(samples.t) // (LONG // 2))
     if stride < 2:
         return samples
-    if samples.f is not None:
-        stride = 1 << (stride.bit_length() - 1)
-    else:
-        strides = range(stride, stride // 2, -1)
-        stride = next((k for k in strides if np.all(alias(fast, k * step) > FARTHER * top)), stride)
+    strides = range(stride, 0, -1) if samples.f is None else [1 << k for k in range(stride.bit_length() - 1, -1, -1)]
+    step, near = mean_step(samples.t), rules.AROUND * np.pi / float(samples.t[-1] - samples.t[0])
+    stride = min(strides, key=lambda k: hidden(fast, k * step, FARTHER * top, near)) if len(fast) else strides[0]
     f = None if samples.f is None else samples.f[::stride]
     u, v = samples.u[::stride], None if samples.v is None else samples.v[::stride]
     return replace(samples, t=samples.t[::stride], u=u, v=v, f=f)

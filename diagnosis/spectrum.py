@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis import rules
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.systems.samples import Samples
 
@@ -25,6 +26,8 @@ MOST_GRID, FINER = 2**20, 4
 # A fast line stands above the median of so many resolutions about it; so many of the strongest are kept, up to this
 # share of half the rate of reading.
 ABOUT, MOST_LINES, HIGHEST = 32, 8, 0.95
+# Times are even where they are so close to it, in steps; a step of so many usual ones is a gap.
+EVEN, GAP = 1e-3, 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,29 +72,73 @@ class Spectrum:
 def lines(samples: Samples, above: float) -> Float[ndarray, " lines"]:
     """Return angular frequencies of the strongest lines that any one sensor shows beyond a frequency, in order.
 
-    A line stands out from the frequencies about it, as mains do in a cable: there the motion has little but a slope.
+    A line stands out from the frequencies about it, as mains do in a cable. Rounded times make lines, too: those that
+    are gone where the readings are taken to be evenly spaced do not count.
     """
-    step = float(np.median(np.diff(samples.t)))
-    omega, sensors = _powers(samples, HOLE * step)
-    size = FINER * ABOUT
-    begin, end = np.searchsorted(omega, [above, HIGHEST * np.pi / step])
-    blocks = (end - begin) // size
-    if blocks < 1:
+    omega, highest = _standing_out(samples, above)
+    inner = np.flatnonzero((highest[1:-1] >= highest[:-2]) & (highest[1:-1] > highest[2:])) + 1
+    tall = inner[highest[inner] > ABOVE]
+    if not len(tall):
         return np.empty(0)
+    even, other, there = _even(samples.t), omega, highest
+    if np.max(np.abs(even - samples.t)) > EVEN * mean_step(samples.t):
+        other, there = _standing_out(replace(samples, t=even), above)
+    near, found = FINER * rules.AROUND // 2, np.empty(0, dtype=int)
+    for one in tall[np.argsort(-highest[tall])]:
+        k = int(np.searchsorted(other, omega[one]))
+        stays = np.max(there[max(k - FINER, 0) : k + FINER], initial=0.0) > ABOVE
+        # The wings of a strong line are no lines of their own.
+        if stays and not np.any(np.abs(found - one) < near) and len(found) < MOST_LINES:
+            found = np.append(found, one)
+    return np.sort(omega[found])
+
+
+def _even(t: Float[ndarray, " time"]) -> Float[ndarray, " time"]:
+    """Return times with equal steps in the place of all steps but gaps, which stay as long as they are."""
+    steps = np.diff(t)
+    return np.asarray(t[0] + np.cumsum([0.0, *np.where(steps < GAP * np.median(steps), mean_step(t), steps)]))
+
+
+def _standing_out(samples: Samples, above: float) -> tuple[ndarray, Float[ndarray, " frequencies"]]:
+    """Return angular frequencies beyond one, and by how many times a sensor stands above what is about it, at most."""
+    omega, sensors = _powers(samples, HOLE * float(np.median(np.diff(samples.t))))
+    size = FINER * ABOUT
+    begin, end = np.searchsorted(omega, [above, HIGHEST * np.pi / mean_step(samples.t)])
+    blocks = max(end - begin, 0) // size
+    if blocks < 1:
+        return np.empty(0), np.zeros(0)
     highest, middles = np.zeros(end - begin), (np.arange(blocks) + 0.5) * size
     for power in sensors:
         part = power[begin:end]
         floor = np.median(part[: blocks * size].reshape(blocks, size), axis=1)
         highest = np.maximum(highest, part / np.maximum(np.interp(np.arange(len(part)), middles, floor), 1e-300))
-    inner = np.flatnonzero((highest[1:-1] >= highest[:-2]) & (highest[1:-1] > highest[2:])) + 1
-    tall = inner[highest[inner] > ABOVE]
-    return np.sort(omega[begin + tall[np.argsort(-highest[tall])][:MOST_LINES]])
+    return omega[begin:end], highest
+
+
+def mean_step(t: Float[ndarray, " time"]) -> float:
+    """Return the mean time between readings but for gaps; where times are rounded, the usual one is another."""
+    steps = np.diff(t)
+    return float(np.mean(steps[steps < GAP * np.median(steps)]))
 
 
 def alias(omega: Float[ndarray, " lines"], step: float) -> Float[ndarray, " lines"]:
     """Return the angular frequencies from 0 to pi/step at which waves appear that are read so far apart."""
     rate = 2 * np.pi / step
     return np.abs((omega + rate / 2) % rate - rate / 2)
+
+
+def hidden(omega: Float[ndarray, " lines"], step: float, above: float, near: float) -> int:
+    """Return how many lines would look like slow ones, like one another or like noise, being read so far apart.
+
+    Args:
+        omega: their angular frequencies.
+        step: between readings.
+        above: what is not beyond this frequency is slow.
+        near: what is no farther apart than this looks alike.
+    """
+    seen = np.sort(alias(omega, step))
+    alike = int(np.sum(np.diff(seen) < near)) if len(seen) > 1 else 0
+    return alike + int(np.sum((seen <= above) | (seen >= HIGHEST * np.pi / step)))
 
 
 def _mean(samples: Samples, gap: float) -> tuple[Float[ndarray, " frequencies"], Float[ndarray, " frequencies"]]:

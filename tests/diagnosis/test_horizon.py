@@ -17,7 +17,7 @@ from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
 from latticebench.diagnosis.problem import FARTHER, LONG, WINDOWS, Problem, thinned, windows
 from latticebench.diagnosis.regression import regressed
-from latticebench.diagnosis.spectrum import alias
+from latticebench.diagnosis.spectrum import hidden
 from latticebench.diagnosis.worth import Worth, misfits
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.lattice import library
@@ -220,15 +220,21 @@ def test_a_long_recording_is_used_thinned_and_in_windows():
     assert all(one.t[-1] < other.t[0] for one, other in itertools.pairwise(parts))
 
 
-def test_a_line_that_is_too_fast_for_the_motion_does_not_look_like_one_of_it_where_a_recording_is_thinned():
-    t = np.arange(40_000) * 0.01
-    samples = Samples(t, np.sin(t)[:, None], source="long", ends="free")
-    usual = thinned(samples, 1.0, np.empty(0)).t[1]
-    # With the usual step this one would be read as a wave of twice the frequency of the motion.
-    fast = 2 * np.pi / usual + 2.0
-    step = thinned(samples, 1.0, np.array([fast])).t[1]
-    assert usual / 2 < step < usual
-    assert alias(np.array([fast]), step) > FARTHER
+@pytest.mark.parametrize("input", [False, True])
+@pytest.mark.parametrize(("count", "cycles"), [(40_000, [2.0]), (4800, [12.5]), (40_000, [12.5]), (40_000, [5.0, 7.5])])
+def test_no_fast_line_is_hidden_where_a_recording_is_thinned(count, cycles, input):
+    t = np.arange(count) * 0.02
+    u = np.sin(2 * np.pi * 0.2 * t)[:, None]
+    samples = Samples(t, u, f=0 * u if input else None, source="long", ends="free")
+    top, fast = 2 * np.pi * 0.2, 2 * np.pi * np.array(cycles)
+    near = 24 * np.pi / t[-1]
+    # With the usual step, some would be read as waves of the motion, as one another, or as noise.
+    usual = thinned(samples, top, np.empty(0)).t[1]
+    chosen = thinned(samples, top, fast).t[1]
+    assert chosen <= usual
+    assert hidden(fast, chosen, FARTHER * top, near) == 0
+    larger = [k for k in range(1, round(usual / 0.02) + 1) if 0.02 * k > 1.01 * chosen and not (input and k & (k - 1))]
+    assert all(hidden(fast, 0.02 * k, FARTHER * top, near) > 0 for k in larger)
 
 
 @pytest.mark.parametrize("middle", [0.0, 0.3, 1.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from latticebench.diagnosis.spectrum import Spectrum, alias, lines
+from latticebench.diagnosis.spectrum import Spectrum, alias, hidden, lines
 from latticebench.systems.samples import Samples
 
 # Cycles per unit of time, and times at which both sensors are read: 50 and 38 cycles, 20 readings in the shorter.
@@ -89,3 +89,37 @@ def test_a_wave_that_is_read_too_seldom_looks_like_its_alias(omega: float) -> No
     (seen,) = alias(np.array([omega]), 1.0)
     assert 0 <= seen <= np.pi
     np.testing.assert_allclose(np.cos(seen * times), np.cos(omega * times), atol=1e-9)
+
+
+def test_what_rounded_times_make_of_the_motion_is_no_line_and_a_hum_beside_it_is() -> None:
+    def read(rate: float, digits: int, hum: float = 0.0) -> Samples:
+        times = np.arange(round(30 * rate)) / rate
+        u = np.cos(2 * np.pi * times) + 0.02 * np.cos(2 * np.pi * hum * times) * (hum > 0)
+        noise = 1e-4 * np.random.default_rng(3).normal(size=len(times))
+        return Samples(np.round(times, digits), (u + noise)[:, None])
+
+    for rate, digits in ((120.0, 3), (30.0, 2), (960.0, 3)):
+        assert len(lines(read(rate, digits), 12 * np.pi)) == 0
+    (found,) = lines(read(120.0, 3, hum=33.3), 12 * np.pi) / (2 * np.pi)
+    assert found == pytest.approx(33.3, abs=0.02)
+
+
+def test_the_wings_of_a_strong_line_are_no_lines() -> None:
+    times = np.arange(3000) * 0.02
+    strong = np.cos(2 * np.pi * times) + 0.5 * np.cos(2 * np.pi * 16.67 * times)
+    samples = Samples(times, (strong + 1e-4 * np.random.default_rng(3).normal(size=3000))[:, None])
+    assert lines(samples, 12 * np.pi) / (2 * np.pi) == pytest.approx([16.67], abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("cycles", "step", "count"),
+    [
+        ([50.0], 0.005, 0), ([50.0], 0.01, 1),  # at half the rate of reading
+        ([50.0], 0.019, 1),  # like a slow one, of 2.6 cycles
+        ([50.0, 150.0], 0.015, 1), ([50.0, 150.0], 0.0025, 0),  # like one another, at 16.7 cycles
+    ],
+)  # fmt: skip
+def test_lines_are_hidden_where_they_look_like_slow_ones_like_one_another_or_like_noise(
+    cycles: list[float], step: float, count: int
+) -> None:
+    assert hidden(2 * np.pi * np.array(cycles), step, above=2 * np.pi * 7.5, near=0.5) == count
