@@ -30,7 +30,7 @@ from latticebench.diagnosis.progress import Found, Horizon, Tried
 from latticebench.diagnosis.regression import regressed, sustained
 from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
-from latticebench.diagnosis.together import MOST_OF_IT, for_two
+from latticebench.diagnosis.together import MOST_OF_IT, in_place
 from latticebench.diagnosis.walk_estimate import won_by_walking
 from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, unlikely, wald
 
@@ -381,7 +381,7 @@ class Search:
         for number, placed in enumerate(effects):
             found = [one for one in self.standing_in(fitted, number) if self._rather(one, placed)]
             every += [((number,), one.placed) for one in found[:2]]
-        for numbers, one in (*every, *for_two(self.problem, self.tangent(fitted))):
+        for numbers, one in (*every, *in_place(self.problem, self.tangent(fitted))):
             model = functools.reduce(Model.without, sorted(numbers, reverse=True), fitted.model).with_effect(one)
             if model not in pool:
                 cheaper = sum(self.problem.price_of(effects[k]) for k in numbers) - self.problem.price_of(one)

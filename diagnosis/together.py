@@ -1,7 +1,8 @@
-"""Two effects that swing at one frequency, and one that does what they do together.
+"""Effects that swing at one frequency, and one that does what they do.
 
 A force at one site and one at all of the same frequency, opposite to each other, move one site alone: so does the hum
-of its sensor. No exchange of one effect leads from these two to that one.
+of its sensor. No exchange of one effect leads from these two to that one. A force that pushes harder than all else does
+what the hum of a sensor does, too.
 """
 
 from __future__ import annotations
@@ -14,24 +15,32 @@ import numpy as np
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.score import Tangent
+from latticebench.diagnosis.worth import pushed
 
 # A candidate may take the place of effects if it can do this share of what they do.
 MOST_OF_IT = 0.9
+# Forces push harder than all else where that costs more nats.
+HARD = 1.0
 
 
-def for_two(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, int], Placed]]:
-    """Yield the numbers of two effects of a model that swing together, with the candidate that does most of both.
+def in_place(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ...], Placed]]:
+    """Yield the numbers of effects of a model that swing together, with the candidate that does most of what they do.
 
-    Frequencies are one where they differ by less than half of what the longest recording resolves.
+    These are any two, and any one where forces push harder than all else. Frequencies are one where they differ by less
+    than half of what the longest recording resolves.
     """
-    swinging = [(k, one.frequency) for k, one in enumerate(tangent.fitted.model.effects) if one.frequency is not None]
-    for (i, first), (j, second) in itertools.combinations(swinging, 2):
-        if abs(first - second) > np.pi / problem.scene.span:
+    effects = tangent.fitted.model.effects
+    swinging = [k for k, one in enumerate(effects) if one.frequency is not None]
+    alone = [(k,) for k in swinging] if pushed(tangent.fitted) > HARD else []
+    # One of each kind and place; all are tuned to the same frequency.
+    places = {one.place: one for one in problem.candidates if one.frequency is not None} if swinging else {}
+    for some in (*alone, *itertools.combinations(swinging, 2)):
+        omega = [float(effects[k].frequency or 0.0) for k in some]
+        there = {effects[k].place for k in some} if len(some) == 1 else set()
+        others = [one.tuned(float(np.mean(omega))) for place, one in places.items() if place not in there]
+        if np.ptp(omega) > np.pi / problem.scene.span or not others:
             continue
-        # One of each kind and place; all are tuned to the same frequency.
-        places = {one.place: one for one in problem.candidates if one.frequency is not None}
-        without = tangent.in_place_of([i, j])
-        scored = without.scored([one.tuned((first + second) / 2) for one in places.values()])
-        best = max(scored, key=lambda one: one.won)
+        without = tangent.in_place_of(some)
+        best = max(without.scored(others), key=lambda one: one.won)
         if best.won > MOST_OF_IT * without.taken > 0:
-            yield (i, j), best.placed
+            yield some, best.placed
