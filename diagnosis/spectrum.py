@@ -26,8 +26,9 @@ MOST_GRID, FINER = 2**20, 4
 # A fast line stands above the median of so many resolutions about it; so many of the strongest are kept, up to this
 # share of half the rate of reading.
 ABOUT, MOST_LINES, HIGHEST = 32, 8, 0.95
-# Times are even where they are so close to it, in steps; a step of so many usual ones is a gap.
-EVEN, GAP = 1e-3, 2.5
+# Times are even where they are so close to it, in steps; a step of so many usual ones is a gap. Rounding takes times so
+# far from even ones, in its units: the mean step and the first time are rounded, too.
+EVEN, GAP, ROUNDED = 1e-3, 2.5, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ def lines(samples: Samples, above: float) -> Float[ndarray, " lines"]:
     if not len(tall):
         return np.empty(0)
     even, other, there = _even(samples.t), omega, highest
-    if np.max(np.abs(even - samples.t)) > EVEN * mean_step(samples.t):
+    if even is not samples.t:
         other, there = _standing_out(replace(samples, t=even), above)
     near, found = FINER * rules.AROUND // 2, np.empty(0, dtype=int)
     for one in tall[np.argsort(-highest[tall])]:
@@ -94,9 +95,17 @@ def lines(samples: Samples, above: float) -> Float[ndarray, " lines"]:
 
 
 def _even(t: Float[ndarray, " time"]) -> Float[ndarray, " time"]:
-    """Return times with equal steps in the place of all steps but gaps, which stay as long as they are."""
+    """Return rounded times with equal steps, but for gaps; others as they are.
+
+    Times are rounded where all are multiples of one power of ten, and equal steps are no farther from them than that.
+    """
     steps = np.diff(t)
-    return np.asarray(t[0] + np.cumsum([0.0, *np.where(steps < GAP * np.median(steps), mean_step(t), steps)]))
+    even = t[0] + np.cumsum([0.0, *np.where(steps < GAP * np.median(steps), mean_step(t), steps)])
+    apart = float(np.max(np.abs(even - t)))
+    if apart < EVEN * mean_step(t):
+        return t
+    unit = 10.0 ** np.ceil(np.log10(apart / ROUNDED))
+    return np.asarray(even) if np.max(np.abs(t / unit - np.round(t / unit))) < EVEN else t
 
 
 def _standing_out(samples: Samples, above: float) -> tuple[ndarray, Float[ndarray, " frequencies"]]:

@@ -123,3 +123,11 @@ def test_lines_are_hidden_where_they_look_like_slow_ones_like_one_another_or_lik
     cycles: list[float], step: float, count: int
 ) -> None:
     assert hidden(2 * np.pi * np.array(cycles), step, above=2 * np.pi * 7.5, near=0.5) == count
+
+
+@pytest.mark.parametrize("digits", [12, 3])
+def test_a_hum_is_a_line_where_times_are_uneven_in_truth(digits: int) -> None:
+    rng = np.random.default_rng(8)
+    times = np.round(0.02 * (np.arange(3000) + rng.uniform(0, 0.9, 3000)), digits)
+    u = np.cos(2 * np.pi * times) + 0.01 * np.cos(2 * np.pi * 16.67 * times) + 0.01 * rng.normal(size=3000)
+    assert lines(Samples(times, u[:, None]), 12 * np.pi) / (2 * np.pi) == pytest.approx([16.67], abs=0.01)
