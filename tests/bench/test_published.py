@@ -128,6 +128,8 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     assert f"and no other in {share(own['right'].iloc[0])}." in words("diagnosis")
     hum = pd.read_csv(RESULTS / "loop" / "hum" / "summary.csv", comment="#", dtype=str)
     assert f"`results/loop/hum`): {share(hum['right'].iloc[0])}." in words("diagnosis")
+    mains = pd.read_csv(RESULTS / "loop" / "mains" / "summary.csv", comment="#", dtype=str)
+    assert f"`results/loop/mains`): {share(mains['right'].iloc[0])}." in words("diagnosis")
     first, later, third = (f"{one.split(' (')[0]} of {one.split()[-1]}" for one in exact)
     assert f"in {first}, {later} and {third} laboratory recordings" in readme
 
