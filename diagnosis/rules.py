@@ -77,7 +77,8 @@ REPELLING = 30.0
 # ln(1 + d^2) nats: Cauchy's prior for where the zero is. A curved scale that is looked at from afar is another gain.
 DISPLACED = 1.0
 # A force with a frequency or a time of its own that pushes d times as hard as all else costs so many times ln(1 + d^2)
-# nats: Cauchy's prior for its size. Far above the chain's own frequencies, it would have to for what a hum reads.
+# nats: Cauchy's prior for its size. Far above the chain's own frequencies a force must push so hard to do what a small
+# hum of a sensor does.
 PUSHED = 1.0
 # A forecast is worse where its error grows by more than this share of itself and is more than so many times the noise:
 # with fewer readings every number more costs a little.

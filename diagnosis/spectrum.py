@@ -26,8 +26,8 @@ MOST_GRID, FINER = 2**20, 4
 # A fast line stands above the median of so many resolutions about it; so many of the strongest are kept, up to this
 # share of half the rate of reading.
 ABOUT, MOST_LINES, HIGHEST = 32, 8, 0.95
-# Times are even where they are so close to it, in steps; a step of so many usual ones is a gap. Rounding takes times so
-# far from even ones, in its units: the mean step and the first time are rounded, too.
+# Steps are equal where no time is farther from equal steps than this share of one; a step as long as so many usual ones
+# is a gap. Rounded times are at most so many units of the rounding from equal steps: the first time is rounded, too.
 EVEN, GAP, ROUNDED = 1e-3, 2.5, 1.5
 
 

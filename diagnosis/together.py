@@ -36,6 +36,7 @@ def in_place(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ..
     places = {one.place: one for one in problem.candidates if one.frequency is not None} if swinging else {}
     for some in (*alone, *itertools.combinations(swinging, 2)):
         omega = [float(effects[k].frequency or 0.0) for k in some]
+        # One of two may do the work of both.
         there = {effects[k].place for k in some} if len(some) == 1 else set()
         others = [one.tuned(float(np.mean(omega))) for place, one in places.items() if place not in there]
         if np.ptp(omega) > np.pi / problem.scene.span or not others:
