@@ -16,8 +16,9 @@ import numpy as np
 
 from latticebench.bench.report.units import noise_in_words, units_of
 from latticebench.diagnosis.instrument import ROBUST, of_readings, step_of, two_digits
-from latticebench.diagnosis.noise import Noise, Rows
+from latticebench.diagnosis.noise import Noise
 from latticebench.diagnosis.noise_estimate import estimate
+from latticebench.diagnosis.rows import Rows
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.methods.engine.record import prepare
 from latticebench.systems.samples import Samples, check_alike

@@ -17,8 +17,9 @@ from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain
 from latticebench.diagnosis.horizon import Followed, Layout, Path, fields, follow, linearised
 from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.noise import Noise, Rows, Structure, Whitener
+from latticebench.diagnosis.noise import Noise, Structure, Whitener
 from latticebench.diagnosis.noise_estimate import SPARE, estimate
+from latticebench.diagnosis.rows import Rows
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -19,9 +19,9 @@ from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain
 from latticebench.diagnosis.border import Border, borders
 from latticebench.diagnosis.model import Assembled, Model
-from latticebench.diagnosis.noise import Rows
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.propagation import propagate
+from latticebench.diagnosis.rows import Rows
 from latticebench.methods.engine.dynamics import Dynamics
 from latticebench.methods.engine.record import Record
 from latticebench.methods.engine.sensitivity import Stretches, Transition

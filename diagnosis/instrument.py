@@ -299,6 +299,8 @@ def describe(
             parts.append(f"correlated over {two_digits(memory)} {time}".rstrip() + near)
         if span is not None and walk > 0:
             parts.append(f"a zero that wanders by {two_digits(walk * np.sqrt(span))} {unit}".rstrip())
+        if noise.common is not None and noise.common.share[number] != 0:
+            parts.append(_in_common(float(noise.common.share[number]), noise.common.memory, time))
         if np.isfinite(noise.tail):
             parts.append(f"tails of Student's t with {two_digits(noise.tail)} degrees of freedom")
         if noise.growth > 0:
@@ -307,6 +309,13 @@ def describe(
     if len(lines) > 1 and len(set(lines.values())) == 1:
         return [f"all sensors: {next(iter(lines.values()))}"]
     return [f"sensor {number + 1}: {line}" for number, line in lines.items()]
+
+
+def _in_common(share: float, memory: float, time: str) -> str:
+    """Return what a sensor has in common with the others in words."""
+    turned = ", of the other sign" if share < 0 else ""
+    slow = f", correlated over {two_digits(memory)} {time}".rstrip() if memory > 0 else ""
+    return f"{two_digits(100 * share**2)} % of its variance in common with the other sensors{turned}{slow}"
 
 
 def two_digits(value: float) -> str:

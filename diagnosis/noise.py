@@ -11,57 +11,29 @@ are independent and follow Student's t distribution with nu degrees of freedom (
 Assoc. 84, 881, 1989), or the normal distribution. Which of these parts are used is the `Structure`; Schwarz' criterion
 (Ann. Stat. 6, 461, 1978) chooses it.
 
-The zero of a sensor may wander besides, see `walk`; the rest of its noise is then white.
+A part may be common to all sensors, see `common`. The zero of a sensor may wander besides, see `walk`; the rest of its
+noise is then white, and its own.
 
 All likelihoods are natural logarithms with their normalising constants, so that those of different structures compare.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis.common import Common, Unmixing
+from latticebench.diagnosis.rows import CLOSEST, Chained, Rows, chained
 from latticebench.diagnosis.walk import Walk
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int, Shaped
+    from jaxtyping import Bool, Float
     from numpy import ndarray
 
     Readings = Float[ndarray, "rows channels"]
     Seen = Bool[ndarray, "rows channels"]
-
-# Readings closer than this share of the typical interval correlate as over that: part of any noise is white, and of
-# white noise two readings at nearly the same time differ as any others.
-CLOSE = 0.2
-# What is left between strongly correlated readings must not be divided by zero.
-CLOSEST = 1e-4
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Times and channels of readings laid out as rows: pieces of one or several recordings, one after another.
-
-    Attributes:
-        times: (rows,), increasing within a piece.
-        first: whether a piece begins (rows,); nothing correlates with the row before.
-        sensor: the sensor of each channel (channels,), from 0; the channels of one sensor, such as the real and the
-            imaginary part of a field, share its noise.
-        least: the smallest size of the noise.
-        curved: sensors of which a free curve takes the slow part of the noise: their own memory, tails and growth
-            cannot be seen, and are taken to be those of the others.
-        walking: sensors whose zeros wander.
-        fastest: how far such a zero goes at most, over the size of its noise, per square root of time.
-    """
-
-    times: Float[ndarray, " rows"]
-    first: Bool[ndarray, " rows"]
-    sensor: Int[ndarray, " channels"]
-    least: float = 0.0
-    curved: frozenset[int] = frozenset()
-    walking: frozenset[int] = frozenset()
-    fastest: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -73,17 +45,24 @@ class Structure:
         growth: the noise grows with the signal.
         tails: the innovations follow Student's t distribution, not the normal one.
         memory: the noise is correlated from one reading to the next.
+        common: a part of it is common to all sensors; with sizes of their own, each has its share. Of two sensors their
+            correlation is all that is seen, and the shares are alike.
     """
 
     own_sizes: bool = False
     growth: bool = False
     tails: bool = False
     memory: bool = False
+    common: bool = False
 
     def parameters(self, sensors: int) -> int:
         """Return how many numbers describe the noise of so many sensors."""
         groups = sensors if self.own_sizes else 1
-        return groups * (1 + self.memory) + self.growth + self.tails
+        return groups * (1 + self.memory) + self.growth + self.tails + self.common * (self.shares(sensors) + 1)
+
+    def shares(self, sensors: int) -> int:
+        """Return how many numbers say what so many sensors have in common."""
+        return sensors if self.own_sizes and sensors > 2 else 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +78,7 @@ class Noise:
         structure: which of these were fitted.
         walk: standard deviation of the walk of each zero after a unit of time (sensors,), in units of the readings;
             empty where no zero wanders.
+        common: what the sensors have in common; None for nothing.
     """
 
     size: Float[ndarray, " sensors"]
@@ -107,6 +87,7 @@ class Noise:
     memory: Float[ndarray, " sensors"]
     structure: Structure
     walk: Float[ndarray, " sensors"] = field(default_factory=lambda: np.zeros(0))
+    common: Common | None = None
 
     @property
     def parameters(self) -> int:
@@ -116,6 +97,13 @@ class Noise:
     def deviation(self) -> Float[ndarray, " sensors"]:
         """Return the standard deviation at zero signal, in units of the readings."""
         return self.size * (np.sqrt(self.tail / (self.tail - 2)) if np.isfinite(self.tail) else 1.0)
+
+    def fresh(self, step: float) -> Float[ndarray, " sensors"]:
+        """Return the size of what is new after a time, in units of the readings."""
+        new = _fresh(self.memory, step)
+        if self.common is not None:
+            new = new + self.common.share**2 * (_fresh(np.array(self.common.memory), step) - new)
+        return np.asarray(self.size * np.sqrt(new))
 
     def log_likelihood(self, left: Readings, level: Readings, rows: Rows) -> float:
         """Return the logarithm of the probability density of residuals, NaN where nothing was read.
@@ -138,15 +126,21 @@ class Noise:
         spread = np.sqrt(1 - rho**2)
         before = np.zeros_like(rho)
         before[1:] = rho[1:] / (spread[1:] * size[:-1])
-        own, log_scale = 1 / (size * spread), np.log(size * spread)
+        own, log_scale = 1 / (size * spread), float(np.sum(np.log(size * spread)))
+        plain = Whitener(chain, seen, own, before, self.tail, log_scale)
+        if self.common is not None:
+            mixed = tuple(self.common.unmixings(rows, seen, chain.grid(rho, seen)))
+            log_scale += sum(one.log_scale for one in mixed)
+            plain = replace(plain, log_scale=log_scale, mixed=mixed)
         if not np.any(self.walk):
-            return Whitener(chain, seen, own, before, self.tail, float(np.sum(log_scale)))
+            return plain
         where = np.flatnonzero(self.walk[chain.sensor] > 0)
         linked = np.isfinite(chain.gap[where])
         time = np.where(linked, chain.gap[where], chain.time[where] - np.min(rows.times))
         walk = Walk.of(where, size[where], self.walk[chain.sensor[where]], time, linked)
-        own[where], before[where], log_scale[where] = 1.0, linked, 0.0
-        return Whitener(chain, seen, own, before, self.tail, float(np.sum(log_scale)) + walk.log_scale, walk)
+        alone = float(np.sum(np.log(size[where] * spread[where])))
+        own[where], before[where] = 1.0, linked
+        return replace(plain, log_scale=log_scale - alone + walk.log_scale, walk=walk)
 
     def still(self, left: Readings, level: Readings, rows: Rows) -> Readings:
         """Return residuals without the walks of zeros, as far as these can be told from the rest of the noise.
@@ -174,7 +168,9 @@ class Whitener:
         seen: where there are readings (rows, channels).
         own, before: factors of each reading of the chain and of the one before it, 0 where there is none.
         tail: degrees of freedom of Student's t.
-        log_scale: sum of the logarithms of the innovations' sizes s_k sqrt(1 - rho_k^2).
+        log_scale: sum of the logarithms of the innovations' sizes s_k sqrt(1 - rho_k^2); with what is common and walks,
+            half the logarithm of the residuals' covariance.
+        mixed: what makes independent innovations where sensors have something in common.
         walk: what makes innovations of the differences of readings whose zeros wander.
     """
 
@@ -184,35 +180,38 @@ class Whitener:
     before: Float[ndarray, " readings"]
     tail: float
     log_scale: float
+    mixed: tuple[Unmixing, ...] = ()
     walk: Walk | None = None
 
     def apply(self, x: Float[ndarray, "rows channels *more"]) -> Float[ndarray, "rows channels *more"]:
         """Return the innovations of residuals or of their derivatives (any further axes), 0 where nothing was seen."""
         along = x.shape[2:]
-        whole = np.swapaxes(x, 0, 1).reshape(self.seen.size, -1)
-        values = whole[self.chain.where]
+        values = self.chain.of(x.reshape(*self.seen.shape, -1))
         z = values * self.own[:, None]
         if np.any(self.before):
             z[1:] -= values[:-1] * self.before[1:, None]
         if self.walk is not None:
             z[self.walk.where] = self.walk.apply(z[self.walk.where])
-        found = np.zeros(whole.shape)
-        found[self.chain.where] = z
-        return np.swapaxes(found.reshape(*self.seen.T.shape, *along), 0, 1)
+        found = self.chain.grid(z, self.seen)
+        for one in self.mixed:
+            found[:, one.some] = one.apply(found[:, one.some])
+        return found.reshape(*self.seen.shape, *along)
 
     def transposed(self, z: Float[ndarray, "rows channels *more"]) -> Float[ndarray, "rows channels *more"]:
         """Return the transposed map: the sum of z times `apply(x)` is that of `transposed(z)` times x."""
         along = z.shape[2:]
-        whole = np.swapaxes(z, 0, 1).reshape(self.seen.size, -1)
-        values = whole[self.chain.where]
+        whole = z.reshape(*self.seen.shape, -1)
+        if self.mixed:
+            whole = whole.copy()
+        for one in self.mixed:
+            whole[:, one.some] = one.transposed(whole[:, one.some])
+        values = self.chain.of(whole)
         if self.walk is not None:
             values[self.walk.where] = self.walk.transposed(values[self.walk.where])
         x = values * self.own[:, None]
         if np.any(self.before):
             x[:-1] -= values[1:] * self.before[1:, None]
-        found = np.zeros(whole.shape)
-        found[self.chain.where] = x
-        return np.swapaxes(found.reshape(*self.seen.T.shape, *along), 0, 1)
+        return self.chain.grid(x, self.seen).reshape(*self.seen.shape, *along)
 
     def robust(self, z: Readings) -> Readings:
         """Return the square root of the weight of each innovation in a least-squares fit, 0 where nothing was seen.
@@ -224,35 +223,9 @@ class Whitener:
         return np.where(self.seen, weight, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Chained:
-    """The readings that were seen, channel after channel: places in a flat array (channels, rows), sensors and times.
-
-    `gap` is the time since the reading before, at least `CLOSE` of the typical one; infinite where there is none in the
-    same channel and piece.
-    """
-
-    where: Int[ndarray, " readings"]
-    sensor: Int[ndarray, " readings"]
-    gap: Float[ndarray, " readings"]
-    time: Float[ndarray, " readings"]
-
-    def of(self, values: Shaped[ndarray, "rows channels"]) -> Shaped[ndarray, " readings"]:
-        """Return the values of the readings in this order."""
-        return np.asarray(values.T.reshape(-1)[self.where])
-
-
-def chained(rows: Rows, seen: Seen) -> Chained:
-    """Return the readings that were seen in their order."""
-    where = np.flatnonzero(seen.T)
-    channel, row = np.divmod(where, max(len(rows.times), 1))
-    piece = np.cumsum(rows.first)[row]
-    linked = (np.diff(channel) == 0) & (np.diff(piece) == 0)
-    gap = np.full(len(where), np.inf)
-    gap[1:] = np.where(linked, np.diff(rows.times[row]), np.inf)
-    apart = gap[np.isfinite(gap) & (gap > 0)]
-    apart_enough = np.maximum(gap, CLOSE * np.median(apart)) if len(apart) else gap
-    return Chained(where, rows.sensor[channel], apart_enough, rows.times[row])
+def _fresh(memory: Float[ndarray, " *sensors"], step: float) -> Float[ndarray, " *sensors"]:
+    """Return the share of the variance that is new after a time."""
+    return np.asarray(np.where(memory > 0, -np.expm1(-2 * step / np.where(memory > 0, memory, 1.0)), 1.0))
 
 
 def minus_log_density(z: Float[ndarray, " readings"], tail: float) -> float:

@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.noise import CLOSEST, Noise, Rows, Structure, chained, minus_log_density
+from latticebench.diagnosis.common import Common
+from latticebench.diagnosis.common_estimate import MOST, Beside
+from latticebench.diagnosis.noise import Noise, Structure, minus_log_density
+from latticebench.diagnosis.rows import CLOSEST, Rows, chained
 from latticebench.diagnosis.walk_estimate import walked
 
 if TYPE_CHECKING:
@@ -29,7 +32,7 @@ LIGHTEST = 1000.0
 # Correlations from one typical reading to the next. A stronger one than the largest may stand for any slow misfit of
 # the equation, which the equation should have to answer for; below the least, the noise is white.
 MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
-# Nats that each part of the structure must win beyond Schwarz' penalty. Four parts are tried, on records of less than a
+# Nats that each part of the structure must win beyond Schwarz' penalty. Five parts are tried, on records of less than a
 # hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100 records.
 MARGIN = 2.0
 # Readings that the structure is chosen from, in stretches all over a longer record: what so many do not show changes
@@ -61,8 +64,8 @@ def estimate(
     others = bool(np.any(np.isfinite(left[:, ~apart])))
     plain = np.where(apart, np.nan, left) if np.any(apart) and others else left
     if structure is not None and rows.walking and not others:
-        # Where all zeros wander, growth and tails are not told from the walks.
-        structure = replace(structure, growth=False, tails=False)
+        # Where all zeros wander, growth, tails and what is common are not told from the walks.
+        structure = replace(structure, growth=False, tails=False, common=False)
     if structure is None:
         start = _chosen(_Task.of(*_glance(plain, level, rows)))
         structure = start.structure
@@ -100,11 +103,14 @@ def _chosen(task: _Task) -> Noise:
     later be done better by another.
     """
     tried: dict[Structure, tuple[float, Noise]] = {}
+    each = np.log(max(len(task.value), 1)) / 2
+    # The common part takes long to fit: it is left alone where it cannot be worth its two numbers.
+    alone = "common" in task.possible and task.beside.promises(task.value) < 2 * each + MARGIN
+    parts = [part for part in task.possible if part != "common" or not alone]
 
     def price(structure: Structure, near: Noise | None) -> float:
         if structure not in tried:
             noise, likelihood = task.best(structure, near)
-            each = np.log(max(len(task.value), 1)) / 2
             tried[structure] = each * noise.parameters + MARGIN * sum(vars(structure).values()) - likelihood, noise
         return tried[structure][0]
 
@@ -112,7 +118,7 @@ def _chosen(task: _Task) -> Noise:
     price(here, None)
     while not task.is_exact():
         found = tried[here][1]
-        ways = [replace(here, **{part: not getattr(here, part)}) for part in task.possible]
+        ways = [replace(here, **{part: not getattr(here, part)}) for part in parts]
         best = min(ways, key=lambda one: price(one, found))
         if tried[best][0] >= tried[here][0]:
             break
@@ -126,6 +132,7 @@ class _Task:
 
     Attributes:
         value, level, sensor: residual and absolute level, divided by `unit`, and sensor of each reading.
+        beside: which readings are taken at one time.
         gap, linked: interval to the reading before, divided by `interval`, and whether there is one.
         even: whether all intervals are alike.
         unit, interval: root mean square of the residuals and median interval.
@@ -136,6 +143,7 @@ class _Task:
     value: Float[ndarray, " readings"]
     level: Float[ndarray, " readings"]
     sensor: Int[ndarray, " readings"]
+    beside: Beside
     gap: Float[ndarray, " readings"]
     linked: Bool[ndarray, " readings"]
     even: bool
@@ -157,10 +165,15 @@ class _Task:
         interval = float(np.median(chain.gap[apart])) if np.any(apart) else 1.0
         gap = np.where(linked, chain.gap, 0.0) / interval
         sensors = int(np.max(rows.sensor, initial=-1)) + 1
-        ways = {"own_sizes": sensors > 1, "growth": height > 0, "tails": True, "memory": bool(np.any(apart))}
+        beside = Beside.of(chain, rows, np.isfinite(left), interval)
+        ways = {
+            "own_sizes": sensors > 1, "growth": height > 0, "tails": True, "memory": bool(np.any(apart)),
+            "common": beside.several,
+        }  # fmt: skip
+        even = bool(np.all(np.abs(gap[linked] - 1) < 1e-6))
         return cls(
-            value / unit, heights / unit, chain.sensor, gap, linked, bool(np.all(np.abs(gap[linked] - 1) < 1e-6)),
-            unit, interval, floor / unit, sensors, tuple(part for part, there in ways.items() if there),
+            value / unit, heights / unit, chain.sensor, beside, gap, linked, even, unit, interval, floor / unit,
+            sensors, tuple(part for part, there in ways.items() if there),
         )  # fmt: skip
 
     def is_exact(self) -> bool:
@@ -182,7 +195,7 @@ class _Task:
         if not len(self.value):
             return plain, 0.0
         numbers = self.packed(start or plain, structure)
-        if self.is_exact() or not (structure.growth or structure.tails or structure.memory):
+        if self.is_exact() or structure in (Structure(), Structure(own_sizes=True)):
             numbers = self.packed(plain, structure)
             found, cost = plain, self.cost(numbers, structure)[0]
         else:
@@ -191,6 +204,8 @@ class _Task:
             bounds += [(np.log(1e-6), np.log(1e6))] * structure.growth
             bounds += [(1 / LIGHTEST, 1 / HEAVIEST)] * structure.tails
             bounds += [(LEAST_CORRELATED, MOST_CORRELATED)] * (groups * structure.memory)
+            bounds += [(LEAST_CORRELATED, MOST_CORRELATED)] * structure.common
+            bounds += [(-MOST, MOST)] * (structure.shares(self.sensors) * structure.common)
             result = minimize(
                 self.cost, numbers, args=(structure,), jac=True, method="L-BFGS-B", bounds=bounds,
                 options={"ftol": 1e-4 / len(self.value), "gtol": 1e-5, "maxiter": 200},
@@ -200,9 +215,12 @@ class _Task:
 
     def lent(self, noise: Noise, curved: Collection[int]) -> Noise:
         """Return the noise of all sensors, of which some have a size of their own and all else from the others."""
+        borrows = np.isin(np.arange(self.sensors), list(curved))
+        if noise.common is not None:
+            share = np.where(borrows, np.mean(noise.common.share[~borrows]), noise.common.share)
+            noise = replace(noise, common=replace(noise.common, share=share))
         if not noise.structure.own_sizes:
             return noise
-        borrows = np.isin(np.arange(self.sensors), list(curved))
         memory = np.where(borrows, np.mean(noise.memory[~borrows]), noise.memory)
         first = self.plain(noise.structure).size / (np.sqrt(2) if np.isfinite(noise.tail) else 1.0)
         found = replace(noise, size=np.where(borrows, first, noise.size), memory=memory)
@@ -249,6 +267,7 @@ class _Task:
     def packed(self, noise: Noise, structure: Structure) -> Float[ndarray, " numbers"]:
         """Return noise as numbers to vary: log sizes, log growth, 1 / nu, correlations over the typical interval.
 
+        Last come that of the common part, and how much of it the sensors have.
         Sizes are those of what is new in a reading, which has a floor: size * sqrt(1 - correlation^2).
         Parts of the structure that the noise does not have get a start of their own; with growth, half of the variance.
         """
@@ -273,27 +292,48 @@ class _Task:
             rho = np.clip(np.exp(-self.interval / time), LEAST_CORRELATED, MOST_CORRELATED)
             size = np.maximum(size * np.sqrt(1 - rho**2), self.floor)
             numbers.append(rho)
+        if structure.common:
+            shares, known = structure.shares(self.sensors), noise.common
+            near = np.exp(-self.interval / (known.memory or 1e-9 * self.interval)) if known else np.exp(-1)
+            numbers.append(np.clip([near], LEAST_CORRELATED, MOST_CORRELATED))
+            begun = self.beside.begun(self.value, shares)
+            numbers.append(begun if known is None else self.beside.reduced(known.share, shares, np.tanh(MOST)))
         return np.concatenate([np.log(size), *numbers])
 
     def unpacked(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> Noise:
         """Return the noise that numbers of `packed` stand for."""
-        size, growth, tail, rho = self.parts(numbers, structure)
-        time = np.where(rho > 1.01 * LEAST_CORRELATED, -self.interval / np.log(np.maximum(rho, LEAST_CORRELATED)), 0.0)
+        size, growth, tail, rho, near, shares = self.parts(numbers, structure)
         everyone = np.ones(self.sensors)
-        return Noise(size * self.unit * everyone, growth, tail, time * everyone, structure)
+        found = Noise(size * self.unit * everyone, growth, tail, self.time(rho) * everyone, structure)
+        if not structure.common:
+            return found
+        read = np.bincount(self.sensor, minlength=self.sensors) > 0
+        return replace(found, common=Common(np.where(read, np.tanh(shares), 0.0), float(self.time(np.array(near)))))
 
-    def parts(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> tuple[ndarray, float, float, ndarray]:
-        """Return sizes, growth, degrees of freedom and correlations over the typical interval."""
+    def time(self, rho: Float[ndarray, " *any"]) -> Float[ndarray, " *any"]:
+        """Return the times over which noise of some correlations over the typical interval is correlated."""
+        return np.where(rho > 1.01 * LEAST_CORRELATED, -self.interval / np.log(np.maximum(rho, LEAST_CORRELATED)), 0.0)
+
+    def parts(
+        self, numbers: Float[ndarray, " numbers"], structure: Structure
+    ) -> tuple[ndarray, float, float, ndarray, float, ndarray]:
+        """Return sizes, growth, degrees of freedom, correlations over the typical interval.
+
+        Last come that of the common part, and a of each sensor.
+        """
         groups = self.groups(structure)[1]
         new, rest = np.exp(numbers[:groups]), list(numbers[groups:])
         growth = float(np.exp(rest.pop(0))) if structure.growth else 0.0
         tail = float(1 / rest.pop(0)) if structure.tails else np.inf
-        rho = np.array(rest) if structure.memory else np.zeros(groups)
-        return new / np.sqrt(1 - rho**2), growth, tail, rho
+        rho, rest = (np.array(rest[:groups]), rest[groups:]) if structure.memory else (np.zeros(groups), rest)
+        near, shares = (rest[0], np.array(rest[1:])) if structure.common else (0.0, np.zeros(self.sensors))
+        if structure.common and len(shares) == 1:
+            shares = shares * self.beside.signed(shares[0])
+        return new / np.sqrt(1 - rho**2), growth, tail, rho, near, shares
 
     def cost(self, numbers: Float[ndarray, " count"], structure: Structure) -> tuple[float, Float[ndarray, " count"]]:
         """Return minus the mean log likelihood of a reading, and its gradient."""
-        size, growth, tail, near = self.parts(numbers, structure)
+        size, growth, tail, near, common, shares = self.parts(numbers, structure)
         group, groups = self.groups(structure)
         s = np.sqrt(size[group] ** 2 + (growth * self.level) ** 2) if structure.growth else size[group]
         y = self.value / s
@@ -304,8 +344,14 @@ class _Task:
         q = 1 / np.sqrt(1 - rho**2)
         before = np.concatenate([[0.0], y[:-1]])
         z = (y - rho * before) * q
-        slope = z if not structure.tails else (tail + 1) * z / (tail + z**2)
-        cost = np.sum(np.log(s)) - np.sum(np.log(q)) + minus_log_density(z, tail)
+        mixed = self.beside.unmixings(shares, common, rho) if structure.common else []
+        e = self.beside.apply(mixed, z) if mixed else z
+        slope = e if not structure.tails else (tail + 1) * e / (tail + e**2)
+        cost = np.sum(np.log(s)) - np.sum(np.log(q)) + minus_log_density(e, tail)
+        cost += sum(one.log_scale for one in mixed)
+        by_own = np.zeros_like(z)
+        if mixed:
+            slope, by_share, by_common, by_own = self.beside.slopes(mixed, z, slope, common)
         # By y of each reading, which its own innovation and the next one depend on.
         by_y = slope * q
         by_y[:-1] -= (slope * q * rho)[1:]
@@ -315,11 +361,15 @@ class _Task:
         if structure.growth:
             gradient.append(np.array([np.sum((1 - share) * by_size)]))
         if structure.tails:
-            gradient.append(np.array([-(tail**2) * _by_tail(z, tail)]))
+            gradient.append(np.array([-(tail**2) * _by_tail(e, tail)]))
         if structure.memory:
-            by_rho = slope * (rho * q * z - before) * q - rho * q**2
+            by_rho = slope * (rho * q * z - before) * q - rho * q**2 + by_own
             by_near = by_rho * rho * np.where(self.linked, self.gap, 0.0) / near[group]
             gradient.append(np.bincount(group, by_near, minlength=groups) + gradient[0] * near / (1 - near**2))
+        if mixed:
+            one = structure.shares(self.sensors) == 1
+            by_shares = np.array([self.beside.signed(numbers[-1]) @ by_share]) if one else by_share
+            gradient += [np.array([by_common]), by_shares]
         return float(cost) / len(y), np.concatenate(gradient) / len(y)
 
 

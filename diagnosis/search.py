@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from latticebench.diagnosis import lengths, rules
+from latticebench.diagnosis import lengths, noise_parts, rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.glance import crowding, most_promising
@@ -22,7 +22,6 @@ from latticebench.diagnosis.inputs import finest, interpolations, likeliest
 from latticebench.diagnosis.mirrored import images, mirrored
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
-from latticebench.diagnosis.noise_estimate import estimate
 from latticebench.diagnosis.past import past_of, settled
 from latticebench.diagnosis.pool import Pool
 from latticebench.diagnosis.problem import Problem
@@ -32,7 +31,7 @@ from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.together import MOST_OF_IT, in_place
 from latticebench.diagnosis.walk_estimate import won_by_walking
-from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, unlikely, wald
+from latticebench.diagnosis.worth import Worth, fine, misfits, over, unlikely, wald
 
 Watcher = Callable[[str], None]
 
@@ -49,10 +48,6 @@ FIRST, CARRIED, CHANGED = 40, 25, 10
 CLIMBING = 2
 # An effect is tried without where its own uncertainty leaves less than so many nats beyond its price.
 DOUBT = 8.0
-# A misfit grows with the signal, too: noise is taken to do so only where no more than so many times the noise is left.
-NEAR = 2.0
-# On so few sensors each has a size and a correlation of its own whether or not that is plain.
-FEW_SENSORS = 8
 
 
 class Search:
@@ -186,22 +181,13 @@ class Search:
         if not fits:
             return []
         self.small = fine(self.problem, fits[0])
-        self._choose_structure(fits[0])
+        self.structure, self.memory = noise_parts.shown(self.problem, fits[0])
         return [fits[0], *fits]
-
-    def _choose_structure(self, fitted: Fitted) -> None:
-        """Let the readings choose the parts of the noise model that all models of a horizon share."""
-        followed = fitted.followed
-        noise = estimate(followed.left, followed.swing, fitted.rows)
-        found, self.memory = noise.structure, float(np.mean(noise.memory))
-        few = len(fitted.rms) <= FEW_SENSORS
-        growth = found.growth and beyond(self.problem, fitted) < NEAR
-        self.structure = replace(found, growth=growth, own_sizes=found.own_sizes or few, memory=found.memory or few)
 
     def _carried(self, last: Found, length: int) -> list[Fitted]:
         """Return the declared equation and the best models on a longer horizon."""
         self.small = fine(self.problem, last.models[0])
-        self._choose_structure(last.models[0])
+        self.structure, self.memory = noise_parts.shown(self.problem, last.models[0])
         return self._laid(last.models, last.before, length, early=len(last.horizons) == 1)
 
     def _laid(self, models: Sequence[Fitted], before: Fitted, length: int, *, early: bool = False) -> list[Fitted]:
@@ -365,13 +351,13 @@ class Search:
     def _likely(self, fitted: Fitted, timed: bool) -> tuple[Fitted, list[Scored]]:
         """Return the candidates whose score is above their price, and the fit that this is so for.
 
-        Noise with a long memory does the work of slow forces: where it leaves no candidate, it is taken as white.
+        Noise with a long memory, or common to all sensors, does the work of forces: where it leaves no candidate, it is
+        taken as white.
         """
         found = self.screened(fitted, timed=timed)
-        if found or np.max(fitted.noise.memory) < self.problem.step:
+        if found or not noise_parts.hides(fitted.noise, self.problem.step):
             return fitted, found
-        tried = self.tried[fitted.model.key]
-        white = replace(fitted, noise=replace(fitted.noise, memory=0 * fitted.noise.memory))
+        tried, white = self.tried[fitted.model.key], replace(fitted, noise=noise_parts.white(fitted.noise))
         found, self.tried[fitted.model.key] = self.screened(white, timed=timed), tried
         return white, found
 

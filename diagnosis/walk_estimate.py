@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.noise import Noise, Rows, chained, minus_log_density
+from latticebench.diagnosis.noise import Noise, minus_log_density
+from latticebench.diagnosis.rows import Rows, chained
 from latticebench.diagnosis.walk import Walk
 
 if TYPE_CHECKING:
@@ -42,7 +43,11 @@ def walked(noise: Noise, left: Readings, level: Readings, rows: Rows, start: Noi
             near = (start.size[sensor], start.walk[sensor]) if start is not None and known else None
             size[sensor], walk[sensor] = task.best(near)
             memory[sensor] = 0.0
-    return replace(noise, size=size, memory=memory, walk=walk)
+    common = noise.common
+    if common is not None:
+        alone = np.isin(np.arange(len(size)), list(rows.walking))
+        common = replace(common, share=np.where(alone, 0.0, common.share))
+    return replace(noise, size=size, memory=memory, walk=walk, common=common)
 
 
 def won_by_walking(noise: Noise, left: Readings, level: Readings, rows: Rows, sensors: Collection[int]) -> ndarray:

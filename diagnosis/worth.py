@@ -68,11 +68,8 @@ def misfits(problem: Problem, fitted: Fitted, *, anywhere: bool = False) -> bool
         fitted: the model.
         anywhere: whether it is enough that it is so at one sensor; else it is at all that have noise.
     """
-    noise = fitted.noise
-    time = np.where(noise.memory > 0, noise.memory, 1e-9 * problem.step)
-    new = noise.size * np.sqrt(-np.expm1(-2 * problem.step / time))
     known = problem.noise > 0
-    large = new[known] > rules.LOST * problem.noise[known]
+    large = fitted.noise.fresh(problem.step)[known] > rules.LOST * problem.noise[known]
     return bool(np.any(large) and (anywhere or np.all(large))) and fitted.has_lines()
 
 

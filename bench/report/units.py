@@ -161,7 +161,8 @@ def noise_in_words(
     for begin in range(0, len(noise.size), sites):
         own = slice(begin, begin + sites)
         size, walk = noise.size[own] / abs(units.scale), noise.walk[own] / abs(units.scale)
-        part = replace(noise, size=size, memory=noise.memory[own], walk=walk)
+        common = None if noise.common is None else replace(noise.common, share=noise.common.share[own])
+        part = replace(noise, size=size, memory=noise.memory[own], walk=walk, common=common)
         unit = units.reading if begin == 0 else rate_of(units.reading, units.time)
         grid = [step / abs(units.scale) for step in steps[own]]
         told = describe(part, grid, unit, interval=interval, time=units.time, span=span)

@@ -14,7 +14,8 @@ import pydantic
 
 from latticebench.bench.report.document import Content
 from latticebench.diagnosis.instrument import two_digits
-from latticebench.diagnosis.noise import Noise, Rows
+from latticebench.diagnosis.noise import Noise
+from latticebench.diagnosis.rows import Rows
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -79,7 +80,8 @@ def _innovations(fitted: Fitted, diagnosis: Diagnosis) -> list[Trajectory]:
     # Curves follow the zeros that wander.
     noise = replace(diagnosis.after.noise, walk=np.zeros(0))
     # Where readings show less noise than the model leaves, the rest is no noise; of correlated noise they show a part.
-    unit = np.where(noise.memory > 0, 1.0, noise.deviation() / diagnosis.noise)
+    correlated = (noise.memory > 0) | (noise.common is not None)
+    unit = np.where(correlated, 1.0, noise.deviation() / diagnosis.noise)
     return [(one.t, _whitened(one, noise, unit)) for one in fitted.curves()]
 
 

@@ -10,8 +10,9 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from latticebench.diagnosis.fitting import spread
-from latticebench.diagnosis.noise import Noise, Rows, Structure
+from latticebench.diagnosis.noise import Noise, Structure
 from latticebench.diagnosis.noise_estimate import estimate
+from latticebench.diagnosis.rows import Rows
 
 EVERY_PART = Structure(own_sizes=True, growth=True, tails=True, memory=True)
 

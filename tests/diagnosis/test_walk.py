@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from latticebench.diagnosis.noise import Noise, Rows, Structure
+from latticebench.diagnosis.noise import Noise, Structure
 from latticebench.diagnosis.noise_estimate import estimate
+from latticebench.diagnosis.rows import Rows
 from latticebench.diagnosis.walk_estimate import won_by_walking
 
 OWN = Structure(own_sizes=True)

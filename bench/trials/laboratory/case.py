@@ -13,6 +13,7 @@ import pydantic
 from latticebench.bench.axes import Listed, Seeds
 from latticebench.bench.case import Case, Folders, Roots, Seed, Settings, plain
 from latticebench.bench.trials.laboratory.effects import ANY, ASKED, MOST_EFFECTS, NONE
+from latticebench.bench.trials.laboratory.instruments import ASKED as ASKED_KINDS
 from latticebench.bench.trials.laboratory.instruments import HELD_OUT, KINDS, Kind
 from latticebench.bench.trials.laboratory.judging import Finding, findings, residual, written
 from latticebench.bench.trials.laboratory.making import LabRecording, make_recording
@@ -65,7 +66,7 @@ class Laboratory(Case):
         Raises:
             Skipped: none with these effects could be made.
         """
-        kinds: dict[str, Kind] = {kind: kind for kind in (*KINDS, *HELD_OUT)}
+        kinds: dict[str, Kind] = {kind: kind for kind in ASKED_KINDS}
         effects = None if self.effects == ANY else [] if self.effects == NONE else self.effects.split("+")
         try:
             return make_recording(self.seed, kinds.get(self.instrument), effects, sites=self.sites or None)
@@ -112,7 +113,7 @@ class Batch(Settings):
     """A block of laboratory recordings in a suite: every combination of the lists is one.
 
     Attributes:
-        instruments: kinds; "any" for one that is drawn, "each" for all that are not held out, "held-out" for those.
+        instruments: kinds; "any" for one that is drawn, "each" for all that may be, "held-out" for those held out.
         effects: names with a + between them; "none" for none, "any" for a drawn number of drawn ones.
         sites: N; drawn if 0.
         seeds: of the recordings.
@@ -138,8 +139,8 @@ class Batch(Settings):
         groups: dict[str, tuple[Kind, ...]] = {"each": KINDS, "held-out": HELD_OUT}
         instruments = [kind for name in self.instruments for kind in groups.get(name, (name,))]
         for name in instruments:
-            if name not in (ANY, *KINDS, *HELD_OUT):
-                raise unknown("instrument", name, [ANY, *groups, *KINDS, *HELD_OUT], where)
+            if name not in (ANY, *ASKED_KINDS):
+                raise unknown("instrument", name, [ANY, *groups, *ASKED_KINDS], where)
         for text in self.effects:
             names = [] if text in (ANY, NONE) else text.split("+")
             for name in names:

@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 
 Kind = Literal[
     "white", "heavy-tailed", "coloured", "coarse", "proportional", "unequal", "spikes", "gaps", "drifting-zero",
-    "jittered-gaps",
+    "jittered-gaps", "shaken",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = (
     "white", "heavy-tailed", "coloured", "coarse", "proportional", "unequal", "spikes", "gaps",
 )  # fmt: skip
 HELD_OUT: tuple[Kind, ...] = ("drifting-zero", "jittered-gaps")
+# All there are; those that are not among `KINDS` come only where they are asked for.
+ASKED: tuple[Kind, ...] = (*KINDS, *HELD_OUT, "shaken")
 QUIETEST, LOUDEST = 0.002, 0.05
 # Rounded times have so many values in an interval.
 DIGITS = 200
@@ -40,6 +42,9 @@ class Instrument:
             the same).
         each: noise of each sensor over `level` (N,).
         memory: correlation of the noise from one reading to the next.
+        common: share of the noise's variance that all sensors have in common, as where a camera shakes.
+        sway: correlation of that part from one reading to the next.
+        turn: how far that part differs between the ends of the chain, over its size in the middle: the camera turns.
         growth: noise at a reading of RMS size over noise at 0, squared, less 1; of proportional noise.
         rate, height: share of readings that are spikes, and the largest size of one in units of the noise.
         drift: how far one sensor's zero goes, in units of the noise; `drifter` is the sensor, and `trend` says
@@ -54,6 +59,9 @@ class Instrument:
     level: float
     each: Float[ndarray, " sites"]
     memory: float = 0.0
+    common: float = 0.0
+    sway: float = 0.0
+    turn: float = 0.0
     growth: float = 0.0
     rate: float = 0.0
     height: float = 0.0
@@ -83,6 +91,9 @@ class Instrument:
         if self.kind == "heavy-tailed":
             return np.asarray(clean + scale * draw.standard_t(FREEDOM, size=clean.shape))
         noise = _correlated(draw.normal(size=clean.shape), self.memory)
+        if self.common:
+            shake = _correlated(draw.normal(size=(len(clean), 1)), self.sway)
+            noise = np.sqrt(1 - self.common) * noise + np.sqrt(self.common) * shake * self.lever
         if self.rate:
             hit = draw.uniform(size=clean.shape) < self.rate
             heights = draw.choice([-1.0, 1.0], size=clean.shape) * draw.uniform(10.0, self.height, size=clean.shape)
@@ -90,6 +101,11 @@ class Instrument:
         if self.drift:
             noise[:, self.drifter] += self.drift * self._course(times, draw)
         return np.asarray(clean + scale * noise)
+
+    @property
+    def lever(self) -> Float[ndarray, " sites"]:
+        """What is common at each sensor over its size in the middle of the chain."""
+        return 1 + self.turn * np.linspace(-0.5, 0.5, len(self.each)) if len(self.each) > 1 else np.ones(1)
 
     def _course(self, times: ndarray, draw: np.random.Generator) -> ndarray:
         """Return how a zero goes: straight on, or as a random walk of the same size."""
@@ -104,6 +120,8 @@ class Instrument:
         The information of Student's t is (nu + 1) / (nu + 3) over the scale squared; a reading that is a spike tells
         nothing. What the noise's own size tells about the reading is left out, and so is a zero that drifts.
         """
+        if self.common:
+            return self._steady(columns / self.scale(clean, rms)[:, :, None])
         scale = self.scale(clean, rms)[:, :, None]
         if self.kind == "coarse":
             # The rounding and the noise of a tenth of a step.
@@ -115,6 +133,24 @@ class Instrument:
         if self.memory:
             weighed[1:] = (weighed[1:] - self.memory * weighed[:-1]) / np.sqrt(1 - self.memory**2)
         return np.asarray(weighed.reshape(-1, columns.shape[2]))
+
+    def _steady(self, columns: Float[ndarray, "time sites columns"]) -> ndarray:
+        """Return columns in independent units of noise that has a part in common, by a Kalman filter of that part.
+
+        The sensors' readings less what is foreseen of the common part have the covariance V I + P w w^T, where V is the
+        variance of their own noise and P that of the common part, as it is foreseen.
+        """
+        own, w = 1 - self.common, np.sqrt(self.common) * self.lever
+        foreseen, variance = np.zeros((1, columns.shape[2])), 1.0
+        found = np.empty_like(columns)
+        for row, part in enumerate(columns):
+            new = part - w[:, None] * foreseen
+            root = np.linalg.cholesky(own * np.eye(len(w)) + variance * np.outer(w, w))
+            found[row] = np.linalg.solve(root, new)
+            pull = variance * np.linalg.solve(root.T, np.linalg.solve(root, w))
+            foreseen = self.sway * (foreseen + pull @ new)
+            variance = self.sway**2 * (variance - variance * float(pull @ w)) + 1 - self.sway**2
+        return np.asarray(found.reshape(-1, columns.shape[2]))
 
     def times(self, span: float, readings: int, draw: np.random.Generator) -> tuple[ndarray, ndarray]:
         """Return the times at which readings are taken, and the times that are recorded."""
@@ -186,6 +222,11 @@ def draw_instrument(draw: np.random.Generator, sites: int, kind: Kind) -> Instru
             return replace(
                 plain, drift=float(draw.choice([-1.0, 1.0]) * draw.uniform(3.0, 8.0)),
                 drifter=int(draw.integers(sites)), trend=bool(draw.uniform() < 0.5),
+            )  # fmt: skip
+        case "shaken":
+            return replace(
+                plain, common=float(draw.uniform(0.3, 0.95)), turn=float(draw.choice([0.0, 1.0]) * draw.uniform(-1, 1)),
+                sway=float(draw.choice([0.0, 1.0, 1.0]) * draw.uniform(0.3, 0.95)),
             )  # fmt: skip
         case "jittered-gaps":
             return replace(

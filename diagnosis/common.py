@@ -1,0 +1,238 @@
+"""The part of the noise that all sensors have in common, as where a camera shakes or a reference is shared.
+
+The noise x_i of a sensor, in units of its size, has a part of its own and one that all have in common:
+
+    x_i = sqrt(1 - c_i^2) y_i + c_i y_0,
+
+so that the correlation of two sensors is c_i c_j (one factor: Spearman, Am. J. Psychol. 15, 201, 1904). y_0 is a
+first-order autoregressive process with a correlation time of its own.
+
+Let z be the innovations of the sensors as if each were by itself, d_i = sqrt(1 - c_i^2), w_i = c_i / d_i, K the sum of
+w_i^2 over the sensors that are read at one time, and h = w / sqrt(K). Across the unit vector h, the numbers z / d are
+independent and of size 1. Along it, p = h^T z / d is white noise of size 1 and sqrt(K) times the innovations that y_0
+has if it is taken to be correlated as the sensors' own noise is, by rho_1. In
+
+    p_k - r_k p_(k-1),    r_k = rho_0 sqrt(K_k / K_(k-1)),
+
+where rho_0 is the correlation of y_0 over the interval, both are moving averages of two numbers: the covariance has
+three diagonals, and its Cholesky factor makes independent numbers f of these, in a time linear in their number. Then
+
+    e = (I - h h^T) z / d + h f
+
+are independent and of size 1. It is exact where the sensors' own parts are white, at any times, and where nothing is
+missing, the times are even and the own parts have one correlation time.
+
+Numbers that may have any value are a_i = artanh c_i: d = 1 / cosh a, w = sinh a. Imaginary parts of complex readings
+have a common part of their own.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.diagnosis.rows import CLOSEST, Rows, gaps
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+    from numpy import ndarray
+
+    from latticebench.diagnosis.rows import Seen
+
+    Grid = Float[ndarray, "rows channels *more"]
+
+
+@dataclass(frozen=True, eq=False)
+class Common:
+    """What the sensors have in common.
+
+    Attributes:
+        share: c of each sensor (sensors,), between -1 and 1.
+        memory: correlation time, in units of time; 0 for white noise.
+    """
+
+    share: Float[ndarray, " sensors"]
+    memory: float = 0.0
+
+    def unmixings(self, rows: Rows, seen: Seen, own: Float[ndarray, "rows channels"]) -> Iterator[Unmixing]:
+        """Yield what makes the readings independent, for each part of theirs.
+
+        Args:
+            rows: their times and sensors.
+            seen: where there are any.
+            own: correlation of each reading's own noise with that of the one before.
+        """
+        numbers, part = np.arctanh(self.share)[rows.sensor], parts_of(rows.sensor)
+        for k in range(int(np.max(part)) + 1):
+            some = np.flatnonzero((part == k) & (numbers != 0))
+            gap = gaps(rows, np.any(seen[:, some], axis=1))
+            rho = np.exp(-gap / self.memory) if self.memory > 0 else np.zeros(len(gap))
+            rho = np.minimum(rho, 1 - CLOSEST)
+            yield Unmixing(some, seen[:, some], numbers[some], rho, own[:, some])
+
+
+def parts_of(sensor: Int[ndarray, " channels"]) -> Int[ndarray, " channels"]:
+    """Return which part of its sensor's readings each channel is: 0, or 1 for an imaginary one."""
+    return np.array([np.count_nonzero(sensor[:k] == one) for k, one in enumerate(sensor)], dtype=int)
+
+
+@dataclass(frozen=True, eq=False)
+class Unmixing:
+    """The linear map to independent innovations, for channels that have a part in common.
+
+    Attributes:
+        some: the channels (some,).
+        seen: where there are readings (rows, some).
+        numbers: a of each channel (some,).
+        rho: correlation of the common part with that at the row before (rows,), 0 at the first of a piece.
+        own: correlation of each reading's own noise with that of the one before (rows, some).
+    """
+
+    some: Int[ndarray, " some"]
+    seen: Bool[ndarray, "rows some"]
+    numbers: Float[ndarray, " some"]
+    rho: Float[ndarray, " rows"]
+    own: Float[ndarray, "rows some"]
+
+    @functools.cached_property
+    def _there(self) -> Int[ndarray, " read"]:
+        """The rows that have readings."""
+        return np.flatnonzero(self.seen @ np.abs(self.numbers) > 0)
+
+    @functools.cached_property
+    def _total(self) -> Float[ndarray, " read"]:
+        """K."""
+        return np.asarray(self.seen[self._there] @ np.sinh(self.numbers) ** 2)
+
+    @functools.cached_property
+    def _along(self) -> Float[ndarray, "read some"]:
+        """H."""
+        return np.asarray(self.seen[self._there] * np.sinh(self.numbers) / np.sqrt(self._total)[:, None])
+
+    @functools.cached_property
+    def _averages(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """r, the shares that the new and the last innovation of y_0 have in p_k - r_k p_(k-1), and rho_1."""
+        rho, total = self.rho[self._there], self._total
+        last = np.concatenate([total[:1], total[:-1]])
+        own = np.where(rho > 0, np.sum(self._along**2 * self.own[self._there], axis=1), 0.0)
+        new = np.sqrt(total * (1 - rho**2) / (1 - own**2))
+        return rho * np.sqrt(total / last), new, own * new, own
+
+    @functools.cached_property
+    def _factor(self) -> Float[ndarray, "two read"]:
+        """The two diagonals of the Cholesky factor L, as SciPy's banded matrices have them."""
+        from scipy.linalg import cholesky_banded
+
+        r, new, old, _ = self._averages
+        covariance = np.zeros((2, len(r)))
+        covariance[0] = 1 + r**2 + new**2 + old**2
+        covariance[1, :-1] = -(r[1:] + old[1:] * new[:-1])
+        return np.asarray(cholesky_banded(covariance, lower=True, check_finite=False)) if len(r) else covariance
+
+    @property
+    def log_scale(self) -> float:
+        """Half the logarithm of the determinant of the covariance of z."""
+        return float(np.sum(np.log(self._factor[0])) - np.sum(self.seen @ np.log(np.cosh(self.numbers))))
+
+    def apply(self, z: Grid) -> Grid:
+        """Return independent innovations, or their derivatives (any further axes); z is 0 where nothing was read."""
+        found = z * _shaped(np.cosh(self.numbers), z, 1)
+        along = self._inner(found[self._there])
+        found[self._there] += self._outer(self._fresh(along) - along)
+        return np.asarray(found)
+
+    def transposed(self, e: Grid) -> Grid:
+        """Return the transposed map: the sum of e times `apply(z)` is that of `transposed(e)` times z."""
+        found, along = e.copy(), self._inner(e[self._there])
+        found[self._there] += self._outer(self._fresh_transposed(along)[0] - along)
+        return np.asarray(found * _shaped(np.cosh(self.numbers), e, 1))
+
+    def slopes(self, z: Grid, by_e: Grid) -> tuple[Grid, Float[ndarray, " some"], Float[ndarray, " rows"], Grid]:
+        """Return derivatives by z, by a, by rho and by the sensors' own correlations, from those by e = apply(z).
+
+        Those of `log_scale` are among the last three.
+        """
+        there, h, total, (r, new, old, own) = self._there, self._along, self._total, self._averages
+        across, by_here = (z * np.cosh(self.numbers))[there], by_e[there]
+        along, pull = np.sum(h * across, axis=1), np.sum(h * by_here, axis=1)
+        fresh = self._fresh(along)
+        by_p, by_difference = self._fresh_transposed(pull)
+        on, beside = self._by_covariance(fresh, by_difference)
+        last, before = np.concatenate([total[:1], total[:-1]]), np.concatenate([[0.0], along[:-1]])
+        by_r = 2 * r * on - beside - by_difference * before
+        by_old = 2 * old * on - beside * np.concatenate([[0.0], new[:-1]])
+        by_new = 2 * new * on + own * by_old
+        by_new[:-1] -= (beside * old)[1:]
+        by_own = np.where(self.rho[there] > 0, new * by_old + by_new * new * own / (1 - own**2), 0.0)
+        by_rho = by_r * np.sqrt(total / last) - by_new * new * self.rho[there] / (1 - self.rho[there] ** 2)
+        by_total = (by_new * new + by_r * r) / (2 * total)
+        by_total[:-1] -= (by_r * r / last)[1:] / 2
+        by_h = by_here * (fresh - along)[:, None] + (by_p - pull)[:, None] * across
+        by_h += 2 * h * by_own[:, None] * self.own[there]
+        by_w = (by_h - h * np.sum(h * by_h, axis=1, keepdims=True)) / np.sqrt(total)[:, None]
+        by_w = self.seen[there] * (by_w + 2 * np.sinh(self.numbers) * by_total[:, None])
+        by_across = by_e.copy()
+        by_across[there] += h * (by_p - pull)[:, None]
+        tilt = np.tanh(self.numbers) * np.sum(by_across * z * np.cosh(self.numbers) - self.seen, axis=0)
+        by_rows, by_owns = np.zeros(len(z)), np.zeros(z.shape)
+        by_rows[there], by_owns[there] = by_rho, h**2 * by_own[:, None]
+        by_a = np.sum(by_w, axis=0) * np.cosh(self.numbers) + tilt
+        return by_across * np.cosh(self.numbers), by_a, by_rows, by_owns
+
+    def _by_covariance(
+        self, fresh: Float[ndarray, " read"], by_difference: Float[ndarray, " read"]
+    ) -> tuple[Float[ndarray, " read"], Float[ndarray, " read"]]:
+        """Return derivatives by the diagonals of the covariance, from f and the derivatives by p_k - r_k p_(k-1).
+
+        L_kk^2 = C_kk - L_k,k-1^2 and L_k,k-1 = C_k,k-1 / L_k-1,k-1, followed backwards.
+        """
+        from scipy.linalg import solve_banded
+
+        size, beside = self._factor[0], np.concatenate([[0.0], self._factor[1, :-1]])
+        by_size = 1 / size - by_difference * fresh
+        by_beside = -by_difference * np.concatenate([[0.0], fresh[:-1]])
+        earlier = np.concatenate([size[:1], size[:-1]])
+        upper = np.ones((2, len(size)))
+        upper[0, 1:] = -(beside**2 / (size * earlier))[1:]
+        right = by_size.copy()
+        right[:-1] -= (by_beside * beside / earlier)[1:]
+        total = solve_banded((0, 1), upper, right, check_finite=False)
+        return total / (2 * size), (by_beside - total * beside / size) / earlier
+
+    def _inner(self, x: Float[ndarray, "read some *more"]) -> Float[ndarray, "read *more"]:
+        return np.asarray(np.einsum("rc,rc...->r...", self._along, x))
+
+    def _outer(self, values: Float[ndarray, "read *more"]) -> Float[ndarray, "read some *more"]:
+        return np.asarray(np.einsum("rc,r...->rc...", self._along, values))
+
+    def _fresh(self, along: Float[ndarray, "read *more"]) -> Float[ndarray, "read *more"]:
+        """Return f from p."""
+        from scipy.linalg import solve_banded
+
+        if not len(along):
+            return along
+        difference = along.copy()
+        difference[1:] -= _shaped(self._averages[0][1:], along, 0) * along[:-1]
+        return np.asarray(solve_banded((1, 0), self._factor, difference, check_finite=False))
+
+    def _fresh_transposed(self, f: Float[ndarray, "read *more"]) -> tuple[ndarray, ndarray]:
+        """Return the transpose of that map applied to numbers, and of its last step alone."""
+        from scipy.linalg import solve_banded
+
+        if not len(f):
+            return f, f
+        upper = np.zeros_like(self._factor)
+        upper[0, 1:], upper[1] = self._factor[1, :-1], self._factor[0]
+        difference = np.asarray(solve_banded((0, 1), upper, f, check_finite=False))
+        found = difference.copy()
+        found[:-1] -= _shaped(self._averages[0][1:], f, 0) * difference[1:]
+        return found, difference
+
+
+def _shaped(values: ndarray, x: ndarray, axis: int) -> ndarray:
+    """Return values in a shape that multiplies x along an axis."""
+    return values.reshape(-1, *(1,) * (x.ndim - 1 - axis))
