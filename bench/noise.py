@@ -133,7 +133,7 @@ def rows_of(data: Sequence[Samples], order: int) -> Rows:
 
 
 def left_by(data: Sequence[Samples], fit: Fit) -> Left:
-    """Return what a fit with a motion leaves of recordings, as noise.
+    """Return what a fit with a motion leaves of recordings, as noise of each sensor's own.
 
     Raises:
         InputError: the recordings differ in their sites, or in what was observed.
@@ -156,7 +156,7 @@ def left_by(data: Sequence[Samples], fit: Fit) -> Left:
         halves = np.split(own, 2, axis=1)
         units[data[0].sites :] = np.sqrt(np.nanmean(halves[1] ** 2) / max(np.nanmean(halves[0] ** 2), TINY)) or 1.0
     scale = units[rows.sensor]
-    noise = estimate(own / scale, level / scale, rows, free=free)
+    noise = estimate(own / scale, level / scale, rows, free=free, common=False)
     noise = replace(noise, size=noise.size * units)
     ratios, silent = _ratios(data, left, noise, rows, order)
     times = float(np.sqrt(np.mean(ratios**2))) if len(ratios) else np.nan

@@ -46,7 +46,7 @@ LENT = 8
 
 def estimate(
     left: Readings, level: Readings, rows: Rows, *, free: Float[ndarray, " sensors"] | float = 0.0,
-    structure: Structure | None = None, start: Noise | None = None,
+    structure: Structure | None = None, start: Noise | None = None, common: bool = True,
 ) -> Noise:  # fmt: skip
     """Return the noise under which residuals are most likely.
 
@@ -58,6 +58,7 @@ def estimate(
             fit leaves residuals that are too small: sizes are multiplied by sqrt(n / (n - free)).
         structure: which parts to use; chosen by Schwarz' criterion if left out.
         start: where to start, such as the noise at the last step of an iteration.
+        common: whether sensors may have something in common where the structure is chosen.
     """
     task = _Task.of(left, level, rows)
     apart = np.isin(rows.sensor, list(rows.curved | rows.walking))
@@ -67,7 +68,7 @@ def estimate(
         # Where all zeros wander, growth, tails and what is common are not told from the walks.
         structure = replace(structure, growth=False, tails=False, common=False)
     if structure is None:
-        start = _chosen(_Task.of(*_glance(plain, level, rows)))
+        start = _chosen(_Task.of(*_glance(plain, level, rows)), common)
         structure = start.structure
     if plain is left:
         found = task.best(structure, start)[0]
@@ -96,7 +97,7 @@ def _glance(left: ndarray, level: ndarray, rows: Rows) -> tuple[ndarray, ndarray
     return left[few], level[few], replace(rows, times=rows.times[few], first=first)
 
 
-def _chosen(task: _Task) -> Noise:
+def _chosen(task: _Task, common: bool) -> Noise:
     """Return the noise of the structure that Schwarz' criterion prefers, found step by step.
 
     One part is added or taken away at a time, whichever helps most, until nothing helps: what one part did alone may
@@ -105,7 +106,7 @@ def _chosen(task: _Task) -> Noise:
     tried: dict[Structure, tuple[float, Noise]] = {}
     each = np.log(max(len(task.value), 1)) / 2
     # The common part takes long to fit: it is left alone where it cannot be worth its two numbers.
-    alone = "common" in task.possible and task.beside.promises(task.value) < 2 * each + MARGIN
+    alone = not common or "common" not in task.possible or task.beside.promises(task.value) < 2 * each + MARGIN
     parts = [part for part in task.possible if part != "common" or not alone]
 
     def price(structure: Structure, near: Noise | None) -> float:
