@@ -20,7 +20,8 @@ three diagonals, and its Cholesky factor makes independent numbers f of these, i
     e = (I - h h^T) z / d + h f
 
 are independent and of size 1. It is exact where the sensors' own parts are white, at any times, and where nothing is
-missing, the times are even and the own parts have one correlation time.
+missing, the times are even and the own parts have one correlation time. Where readings are missing here and there, own
+parts that are correlated are far from it: the estimate does not use both, see `Beside.ragged`.
 
 Numbers that may have any value are a_i = artanh c_i: d = 1 / cosh a, w = sinh a. Imaginary parts of complex readings
 have a common part of their own.
@@ -72,7 +73,7 @@ class Common:
             gap = gaps(rows, np.any(seen[:, some], axis=1))
             rho = np.exp(-gap / self.memory) if self.memory > 0 else np.zeros(len(gap))
             rho = np.minimum(rho, 1 - CLOSEST)
-            yield Unmixing(some, seen[:, some], numbers[some], rho, own[:, some])
+            yield Unmixing(some, seen[:, some], numbers[some], np.isfinite(gap), rho, own[:, some])
 
 
 def parts_of(sensor: Int[ndarray, " channels"]) -> Int[ndarray, " channels"]:
@@ -88,13 +89,15 @@ class Unmixing:
         some: the channels (some,).
         seen: where there are readings (rows, some).
         numbers: a of each channel (some,).
-        rho: correlation of the common part with that at the row before (rows,), 0 at the first of a piece.
+        linked: whether there is a row before with readings, in the same piece (rows,).
+        rho: correlation of the common part with that at the row before (rows,), 0 where there is none.
         own: correlation of each reading's own noise with that of the one before (rows, some).
     """
 
     some: Int[ndarray, " some"]
     seen: Bool[ndarray, "rows some"]
     numbers: Float[ndarray, " some"]
+    linked: Bool[ndarray, " rows"]
     rho: Float[ndarray, " rows"]
     own: Float[ndarray, "rows some"]
 
@@ -110,17 +113,24 @@ class Unmixing:
 
     @functools.cached_property
     def _along(self) -> Float[ndarray, "read some"]:
-        """H."""
+        """The unit vector h."""
         return np.asarray(self.seen[self._there] * np.sinh(self.numbers) / np.sqrt(self._total)[:, None])
+
+    @functools.cached_property
+    def _second(self) -> Bool[ndarray, " read"]:
+        """Whether the row before is the first of its piece, where y_0 and the sensors' noise begin."""
+        linked = self.linked[self._there]
+        return np.asarray(linked & np.concatenate([[False], ~linked[:-1]]))
 
     @functools.cached_property
     def _averages(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """r, the shares that the new and the last innovation of y_0 have in p_k - r_k p_(k-1), and rho_1."""
         rho, total = self.rho[self._there], self._total
         last = np.concatenate([total[:1], total[:-1]])
-        own = np.where(rho > 0, np.sum(self._along**2 * self.own[self._there], axis=1), 0.0)
+        own = np.where(self.linked[self._there], np.sum(self._along**2 * self.own[self._there], axis=1), 0.0)
         new = np.sqrt(total * (1 - rho**2) / (1 - own**2))
-        return rho * np.sqrt(total / last), new, own * new, own
+        begun = np.sqrt(total) * (rho - (rho - own) / np.sqrt(1 - own**2))
+        return rho * np.sqrt(total / last), new, np.where(self._second, begun, own * new), own
 
     @functools.cached_property
     def _factor(self) -> Float[ndarray, "two read"]:
@@ -165,11 +175,16 @@ class Unmixing:
         last, before = np.concatenate([total[:1], total[:-1]]), np.concatenate([[0.0], along[:-1]])
         by_r = 2 * r * on - beside - by_difference * before
         by_old = 2 * old * on - beside * np.concatenate([[0.0], new[:-1]])
-        by_new = 2 * new * on + own * by_old
+        by_begun = np.where(self._second, by_old, 0.0)
+        by_new = 2 * new * on + own * (by_old - by_begun)
         by_new[:-1] -= (beside * old)[1:]
-        by_own = np.where(self.rho[there] > 0, new * by_old + by_new * new * own / (1 - own**2), 0.0)
-        by_rho = by_r * np.sqrt(total / last) - by_new * new * self.rho[there] / (1 - self.rho[there] ** 2)
-        by_total = (by_new * new + by_r * r) / (2 * total)
+        by_own = new * (by_old - by_begun) + by_new * new * own / (1 - own**2)
+        narrow, rho = np.sqrt(1 - own**2), self.rho[there]
+        by_own += by_begun * np.sqrt(total) * (1 / narrow - (rho - own) * own / narrow**3)
+        by_own = np.where(self.linked[there], by_own, 0.0)
+        by_rho = by_r * np.sqrt(total / last) - by_new * new * rho / (1 - rho**2)
+        by_rho += by_begun * np.sqrt(total) * (1 - 1 / narrow)
+        by_total = (by_new * new + by_r * r + by_begun * old) / (2 * total)
         by_total[:-1] -= (by_r * r / last)[1:] / 2
         by_h = by_here * (fresh - along)[:, None] + (by_p - pull)[:, None] * across
         by_h += 2 * h * by_own[:, None] * self.own[there]

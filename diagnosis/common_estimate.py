@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,10 +17,12 @@ if TYPE_CHECKING:
 
     Each = Float[ndarray, " readings"]
 
-# The largest number a, at which a sensor's own noise is less than a thousandth of all of it.
+# The largest number a, at which a sensor's own noise is a thousandth of all of it.
 MOST = 7.6
 # How little and how much of the noise a search begins with, as a correlation c.
 BEGIN_LEAST, BEGIN_MOST = 0.1, 0.95
+# Where more than this share of the rows lack the reading of a sensor, own correlations in time are not used besides.
+RAGGED = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,13 @@ class Beside:
         """Whether some are: readings of several sensors."""
         return any(len(some) > 1 and np.any(np.sum(self.seen[:, some], axis=1) > 1) for some, _ in self.parts)
 
+    @functools.cached_property
+    def ragged(self) -> bool:
+        """Whether many rows have readings of some sensors only, of those that are read at all."""
+        counts = [np.sum(self.seen[:, some], axis=1) for some, _ in self.parts]
+        some = [np.mean(one[one > 0] < np.max(one)) if np.any(one) else 0.0 for one in counts]
+        return max(some, default=0.0) > RAGGED
+
     def promises(self, value: Each) -> float:
         """Return about how many nats one common part of white noise is worth, from the correlations of residuals.
 
@@ -61,9 +71,10 @@ class Beside:
         Math. Stat. 34, 122, 1963).
         """
         rows = sum(np.count_nonzero(np.sum(self.seen[:, some], axis=1) > 1) for some, _ in self.parts)
-        most = float(np.clip(np.linalg.eigvalsh(self._correlations(value))[-1], 1.0, self.sensors - 1e-9))
-        rest = (self.sensors - most) / (self.sensors - 1)
-        return -rows / 2 * float(np.log(most) + (self.sensors - 1) * np.log(rest))
+        count = len(np.unique(self.chain.sensor))
+        most = float(np.clip(np.linalg.eigvalsh(self._correlations(value))[-1], 1.0, count - 1e-9))
+        rest = (count - most) / (count - 1)
+        return -rows / 2 * float(np.log(most) + (count - 1) * np.log(rest))
 
     def signed(self, number: float) -> Float[ndarray, " sensors"]:
         """Return the sign of each sensor's a where one number says them all: of two, the other one may be turned."""
@@ -93,8 +104,8 @@ class Beside:
         own, a = self.chain.grid(rho, self.seen), numbers[self.sensor]
         every = [np.where(np.isfinite(gap), np.minimum(near**gap, 1 - CLOSEST), 0.0) for _, gap in self.parts]
         return [
-            Unmixing(some, self.seen[:, some], a[some], common, own[:, some])
-            for (some, _), common in zip(self.parts, every, strict=True)
+            Unmixing(some, self.seen[:, some], a[some], np.isfinite(gap), common, own[:, some])
+            for (some, gap), common in zip(self.parts, every, strict=True)
         ]
 
     def apply(self, mixed: list[Unmixing], z: Each) -> Each:

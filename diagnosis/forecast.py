@@ -167,7 +167,9 @@ def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Predi
     rows, nodes = again.layout.rows[number], again.followed.nodes[number]
     cut = int(np.max(rows)) + 1
     late = record.times[cut : cut + MOST_ROWS]
-    past = _Past(record.times[rows[-1]], nodes[-1], problem)
+    # A piece that is shorter than others has its last row again and again.
+    last = again.layout.valid[number][-1]
+    past = _Past(record.times[rows[-1][last]], nodes[-1][last], problem)
     model = model.with_past((past,))
     assembled = model.assembled(problem.plain, problem.chain, number)
     state, found = nodes[-1, -1], []

@@ -45,6 +45,9 @@ FAST = 0.2
 BANDS, FEWEST_LINES = 16, 8
 # A size within so many times the smallest that is looked for may be any smaller one.
 AT_LEAST = 1.1
+# Less than this share of the variance in common is not said.
+LEAST_COMMON = 0.01
+WITH_OTHERS = "in common with the other sensors"
 ROBUST = 1.4826  # standard deviation over median absolute value, of a Gaussian
 
 
@@ -299,23 +302,24 @@ def describe(
             parts.append(f"correlated over {two_digits(memory)} {time}".rstrip() + near)
         if span is not None and walk > 0:
             parts.append(f"a zero that wanders by {two_digits(walk * np.sqrt(span))} {unit}".rstrip())
-        if noise.common is not None and noise.common.share[number] != 0:
-            parts.append(_in_common(float(noise.common.share[number]), noise.common.memory, time))
+        if noise.common is not None and noise.common.share[number] ** 2 > LEAST_COMMON:
+            turned = noise.common.share[number] * np.sum(noise.common.share) < 0
+            parts.append(_in_common(float(noise.common.share[number] ** 2), turned, noise.common.memory, time))
         if np.isfinite(noise.tail):
             parts.append(f"tails of Student's t with {two_digits(noise.tail)} degrees of freedom")
         if noise.growth > 0:
             parts.append(f"grows with the signal by {two_digits(100 * noise.growth)} %")
         lines[number] = ", ".join(parts)
     if len(lines) > 1 and len(set(lines.values())) == 1:
-        return [f"all sensors: {next(iter(lines.values()))}"]
+        return [f"all sensors: {next(iter(lines.values()))}".replace(WITH_OTHERS, "in common")]
     return [f"sensor {number + 1}: {line}" for number, line in lines.items()]
 
 
-def _in_common(share: float, memory: float, time: str) -> str:
-    """Return what a sensor has in common with the others in words."""
-    turned = ", of the other sign" if share < 0 else ""
+def _in_common(share: float, turned: bool, memory: float, time: str) -> str:
+    """Return what share of its variance a sensor has in common with the others in words."""
+    round_ = ", turned round" if turned else ""
     slow = f", correlated over {two_digits(memory)} {time}".rstrip() if memory > 0 else ""
-    return f"{two_digits(100 * share**2)} % of its variance in common with the other sensors{turned}{slow}"
+    return f"{two_digits(100 * share)} % of its variance {WITH_OTHERS}{round_}{slow}"
 
 
 def two_digits(value: float) -> str:

@@ -169,7 +169,7 @@ class Whitener:
         own, before: factors of each reading of the chain and of the one before it, 0 where there is none.
         tail: degrees of freedom of Student's t.
         log_scale: sum of the logarithms of the innovations' sizes s_k sqrt(1 - rho_k^2); with what is common and walks,
-            half the logarithm of the residuals' covariance.
+            half the logarithm of the determinant of the residuals' covariance.
         mixed: what makes independent innovations where sensors have something in common.
         walk: what makes innovations of the differences of readings whose zeros wander.
     """

@@ -105,8 +105,8 @@ def _chosen(task: _Task, common: bool) -> Noise:
     """
     tried: dict[Structure, tuple[float, Noise]] = {}
     each = np.log(max(len(task.value), 1)) / 2
-    # The common part takes long to fit: it is left alone where it cannot be worth its two numbers.
-    alone = not common or "common" not in task.possible or task.beside.promises(task.value) < 2 * each + MARGIN
+    # The common part takes long to fit: it is left alone where it is far from worth its two numbers.
+    alone = not common or "common" not in task.possible or task.beside.promises(task.value) < each + MARGIN / 2
     parts = [part for part in task.possible if part != "common" or not alone]
 
     def price(structure: Structure, near: Noise | None) -> float:
@@ -192,6 +192,8 @@ class _Task:
         from scipy.optimize import minimize
 
         structure = replace(structure, **{part: False for part in vars(structure) if part not in self.possible})
+        if structure.common and self.beside.ragged:
+            structure = replace(structure, memory=False)
         plain = self.plain(structure)
         if not len(self.value):
             return plain, 0.0
@@ -218,7 +220,9 @@ class _Task:
         """Return the noise of all sensors, of which some have a size of their own and all else from the others."""
         borrows = np.isin(np.arange(self.sensors), list(curved))
         if noise.common is not None:
-            share = np.where(borrows, np.mean(noise.common.share[~borrows]), noise.common.share)
+            known = ~borrows & (noise.common.share != 0)
+            mean = np.mean(noise.common.share[known]) if np.any(known) else 0.0
+            share = np.where(borrows, mean, noise.common.share)
             noise = replace(noise, common=replace(noise.common, share=share))
         if not noise.structure.own_sizes:
             return noise

@@ -69,6 +69,9 @@ def shaken(seed, count, share, memory, *, sizes=1.0):
         (0.0, 0.4, 0.3, (0, 1, 2)),
         (0.0, 0.4, 0.3, (0, 1, 2, 0, 1, 2)),
         (0.25, 0.25, 0.0, (0, 1, 2)),
+        (0.25, 0.0, 0.0, (0, 1, 2)),
+        (0.05, 2.0, 0.0, (0, 1, 2)),
+        (0.5, 0.1, 0.0, (0, 1, 2, 0, 1, 2)),
     ],
 )
 def test_the_likelihood_is_that_of_a_normal_distribution_with_the_whole_covariance(own, memory, gone, sensor):
@@ -180,10 +183,33 @@ def test_a_sensor_that_was_never_read_has_nothing_in_common():
 
 def test_a_sensor_whose_noise_a_curve_follows_has_the_mean_share_of_the_others():
     left = shaken(8, 1500, (0.8,) * 4, 0.5)
+    left[:, 2] = np.nan
     rows = replace(rows_of(1500, range(4)), curved=frozenset([0]))
     for structure in (SHARED, Structure(common=True)):
         found = estimate(left, 0 * left, rows, structure=structure)
-        assert found.common.share[0] == pytest.approx(np.mean(found.common.share[1:]))
+        assert found.common.share[0] == pytest.approx(np.mean(found.common.share[[1, 3]]))
+        assert found.common.share[0] > 0.7
+
+
+def test_the_likelihood_of_an_estimate_is_that_of_the_search_for_it_at_its_bounds_too():
+    for seed in range(3):
+        draw = np.random.default_rng(seed)
+        own = lfilter([0.6], [1.0, -0.8], draw.normal(size=(400, 3)), axis=0)
+        left = np.sqrt(0.4) * own + np.sqrt(0.6) * draw.normal(size=(400, 1))
+        rows = rows_of(400, range(3))
+        task = _Task.of(left, np.ones_like(left), rows)
+        found, height = task.best(replace(SHARED, memory=True), None)
+        assert found.log_likelihood(left, np.ones_like(left), rows) == pytest.approx(height, abs=0.5)
+
+
+def test_sensors_that_are_read_in_turn_have_no_memory_of_their_own_beside_what_is_common():
+    left = shaken(9, 600, (0.8, 0.8, 0.8), 0.7)
+    left[np.random.default_rng(10).random(left.shape) < 0.2] = np.nan
+    rows = rows_of(600, range(3))
+    found = estimate(left, 0 * left, rows, structure=replace(SHARED, memory=True))
+    assert not found.structure.memory
+    assert np.all(found.memory == 0)
+    np.testing.assert_allclose(found.common.share, 0.8, atol=0.1)
 
 
 # The diagnosis --------------------------------------------------------------------------------------------------------
@@ -192,7 +218,7 @@ def test_a_sensor_whose_noise_a_curve_follows_has_the_mean_share_of_the_others()
 def test_the_report_says_what_sensors_have_in_common():
     lines = describe(noise_of((0.9, -0.6), 0.5), [0.0, 0.0], "mm", interval=0.1, time="s")
     assert "81 % of its variance in common with the other sensors, correlated over 0.5 s" in lines[0]
-    assert "36 % of its variance in common with the other sensors, of the other sign" in lines[1]
+    assert "36 % of its variance in common with the other sensors, turned round" in lines[1]
 
 
 def test_information_in_noise_with_a_common_part_is_that_of_its_covariance():

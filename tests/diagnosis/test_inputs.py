@@ -11,6 +11,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import make_interp_spline
 
 from latticebench.diagnosis.fitting import fit
+from latticebench.diagnosis.forecast import predict
 from latticebench.diagnosis.glance import crowding
 from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.inputs import interpolations, likeliest
@@ -171,6 +172,19 @@ def test_what_is_fed_with_its_past_is_fed_by_its_own_motion():
     assert own.rms[0] > 1.1 * guided.rms[0]
     past = past_of(problem, own.layout, own.model, own.followed.nodes)[0]
     np.testing.assert_allclose(own.model.effects[0].past[0](T), past(T), atol=5 * own.rms[0])
+
+
+def test_a_motion_with_a_past_is_forecast_where_the_last_piece_is_shorter_than_others():
+    problem = Problem.of(DECLARED, 2, [recording("smooth", cube=0.01)], [find("memory")]).interpolated(7).first(0.98)
+    length = 120
+    early = Layout.of(problem.first(0.7), length, None, NOISE).valid[0]
+    assert np.sum(early[-1]) < early.shape[1]
+    layout = Layout.of(problem, length, None, NOISE)
+    near = [nodes[rows] for nodes, rows in zip(problem.nodes, layout.rows, strict=True)]
+    model = Model(DECLARED, 2, TRUTH, (problem.candidates[0].moved([0.05, 0.2]),))
+    found = fit(model, layout.with_substeps(model, near, problem.top), near, structure=Structure())
+    (forecast,) = predict(found, problem)
+    assert np.isfinite(forecast.error)
 
 
 def test_no_past_comes_after_the_present():
