@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.common import Common
 from latticebench.diagnosis.common_estimate import MOST, Beside
 from latticebench.diagnosis.noise import Noise, Structure, minus_log_density
@@ -32,8 +33,8 @@ LIGHTEST = 1000.0
 # Correlations from one typical reading to the next. A stronger one than the largest may stand for any slow misfit of
 # the equation, which the equation should have to answer for; below the least, the noise is white.
 MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
-# Nats that each part of the structure must win beyond Schwarz' penalty. Five parts are tried, on records of less than a
-# hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100 records.
+# Nats that each part of the structure but `common` must win beyond Schwarz' penalty. Five parts are tried, on records of
+# less than a hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100 records.
 MARGIN = 2.0
 # Readings that the structure is chosen from, in stretches all over a longer record: what so many do not show changes
 # sizes by less than a per cent.
@@ -106,13 +107,14 @@ def _chosen(task: _Task, common: bool) -> Noise:
     tried: dict[Structure, tuple[float, Noise]] = {}
     each = np.log(max(len(task.value), 1)) / 2
     # The common part takes long to fit: it is left alone where it is far from worth its two numbers.
-    alone = not common or "common" not in task.possible or task.beside.promises(task.value) < each + MARGIN / 2
+    alone = not common or "common" not in task.possible or task.beside.promises(task.value) < each + rules.IN_COMMON / 2
     parts = [part for part in task.possible if part != "common" or not alone]
 
     def price(structure: Structure, near: Noise | None) -> float:
         if structure not in tried:
             noise, likelihood = task.best(structure, near)
-            tried[structure] = each * noise.parameters + MARGIN * sum(vars(structure).values()) - likelihood, noise
+            margins = MARGIN * (sum(vars(structure).values()) - structure.common) + rules.IN_COMMON * structure.common
+            tried[structure] = each * noise.parameters + margins - likelihood, noise
         return tried[structure][0]
 
     here = Structure()

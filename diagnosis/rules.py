@@ -80,6 +80,9 @@ DISPLACED = 1.0
 # nats: Cauchy's prior for its size. Far above the chain's own frequencies a force must push so hard to do what a small
 # hum of a sensor does.
 PUSHED = 1.0
+# Nats that a part of the noise which all sensors have in common must win beyond Schwarz' penalty (Ann. Stat. 6, 461,
+# 1978): without it a camera that shakes is a force on all sites, and with it a misfit could pass for noise.
+IN_COMMON = 2.0
 # A forecast is worse where its error grows by more than this share of itself and is more than so many times the noise:
 # with fewer readings every number more costs a little.
 WORSE, BEYOND_NOISE = 0.05, 2.0

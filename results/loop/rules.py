@@ -46,7 +46,7 @@ OFF: Mapping[str, Any] = {
     "MOST_EFFECTS": 100, "EQUAL": NEVER, "SLOWER": ALWAYS, "PERIODS": NEVER, "FIRST_HORIZON": 1e6, "MOVES": ALWAYS,
     "AT_ONCE": NEVER, "FASTER": rules.GROWTH, "ALMOST": 1.0, "BORDER": 1e6, "LOST": ALWAYS, "FOLLOWED": NEVER,
     "SHARE": NEVER, "SHARE_TIMED": NEVER, "REPELLING": NEVER, "DISPLACED": NEVER, "PLAINER": NEVER, "LEANER": NEVER,
-    "PUSHED": NEVER, "WORSE": ALWAYS, "BEYOND_NOISE": NEVER,
+    "PUSHED": NEVER, "IN_COMMON": ALWAYS, "WORSE": ALWAYS, "BEYOND_NOISE": NEVER,
 }  # fmt: skip
 # Numbers that only mean something as they are, or that are gone with another one.
 NEITHER = {"STAND_INS"}
@@ -59,6 +59,8 @@ KINDS_OF_RECORDINGS = {
     "wandering": "laboratory recordings of one to three sites, one of whose zeros drifts or wanders: as missing",
     "bent": "laboratory recordings of two sites that rub, with a gain, offsets and a curve of one sensor: as missing",
     "mains": "laboratory recordings of two sites with damping, one of whose sensors has mains in its cable: as missing",
+    "shaken": "laboratory recordings of two or three sites and a shaking camera, every other one with nothing missing: "
+    "as missing, or as nothing",
     "unnamed": "short recordings of 25 sites with an effect that has no name: the verdict says that something is left",
     "relaxing": "short recordings of a Ginzburg-Landau lattice of 25 sites, one effect missing: it alone is named",
     "measured": "measured recordings: the effects that are known to be there are named, and the forecast is not worse",
@@ -72,6 +74,7 @@ SEEDS = {
     "wandering": range(35000, 35018),
     "bent": range(36000, 36016),
     "mains": range(39000, 39016),
+    "shaken": range(42000, 42016),
 }
 SITES = (1, 2, 3)
 # What is missing where a sensor is bent, and where one has mains.
@@ -121,6 +124,11 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
     ]
     for kind, effects in (("bent", BENT), ("mains", MAINS)):
         found += [(kind, str(seed), Laboratory(seed=seed, sites=2, effects=effects)) for seed in SEEDS[kind]]
+    found += [
+        ("shaken", str(seed), Laboratory(seed=seed, sites=SITES[1 + place // 2 % 2], instrument="shaken",
+                                         effects="none" if place % 2 else "any"))
+        for place, seed in enumerate(SEEDS["shaken"])
+    ]  # fmt: skip
     for seed in SEEDS["unnamed"]:
         trials = [(name, Trial(system="phi4", effect=name, z=30.0, seed=seed)) for name in [*FIFTH_BLIND][::EVERY]]
         found += [("unnamed", f"{name} {seed}", trial) for name, trial in trials]
@@ -136,9 +144,9 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
 
 def judged(kind: str, name: str, result: Mapping[str, Any]) -> dict[str, Any]:
     """Return the verdict, what was named, and whether that is right."""
-    if kind in ("missing", "nothing", "wandering", "bent", "mains"):
+    if kind in ("missing", "nothing", "wandering", "bent", "mains", "shaken"):
         row = laboratory.table([result]).iloc[0]
-        right = row["right"] and not (kind == "nothing" and row["verdict"] == "unexplained")
+        right = row["right"] and not (kind in ("nothing", "shaken") and row["verdict"] == "unexplained")
         return {"truth": row["truth"], "verdict": row["verdict"], "named": row["named"], "right": right}
     if kind in ("unnamed", "relaxing"):
         row = scores.table([result]).iloc[0]
