@@ -33,8 +33,8 @@ LIGHTEST = 1000.0
 # Correlations from one typical reading to the next. A stronger one than the largest may stand for any slow misfit of
 # the equation, which the equation should have to answer for; below the least, the noise is white.
 MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
-# Nats that each part of the structure but `common` must win beyond Schwarz' penalty. Five parts are tried, on records of
-# less than a hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100 records.
+# Nats that each part of the structure but `common` must win beyond Schwarz' penalty. Five parts are tried, on records
+# of less than a hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100 records.
 MARGIN = 2.0
 # Readings that the structure is chosen from, in stretches all over a longer record: what so many do not show changes
 # sizes by less than a per cent.
