@@ -121,7 +121,7 @@ class Instrument:
         nothing. What the noise's own size tells about the reading is left out, and so is a zero that drifts.
         """
         if self.common:
-            return self._steady(columns / self.scale(clean, rms)[:, :, None])
+            return self._filtered(columns / self.scale(clean, rms)[:, :, None])
         scale = self.scale(clean, rms)[:, :, None]
         if self.kind == "coarse":
             # The rounding and the noise of a tenth of a step.
@@ -134,7 +134,7 @@ class Instrument:
             weighed[1:] = (weighed[1:] - self.memory * weighed[:-1]) / np.sqrt(1 - self.memory**2)
         return np.asarray(weighed.reshape(-1, columns.shape[2]))
 
-    def _steady(self, columns: Float[ndarray, "time sites columns"]) -> ndarray:
+    def _filtered(self, columns: Float[ndarray, "time sites columns"]) -> ndarray:
         """Return columns in independent units of noise that has a part in common, by a Kalman filter of that part.
 
         The sensors' readings less what is foreseen of the common part have the covariance V I + P w w^T, where V is the
