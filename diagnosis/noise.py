@@ -29,11 +29,12 @@ from latticebench.diagnosis.rows import CLOSEST, Chained, Rows, chained
 from latticebench.diagnosis.walk import Walk
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Float
     from numpy import ndarray
 
+    from latticebench.diagnosis.rows import Seen
+
     Readings = Float[ndarray, "rows channels"]
-    Seen = Bool[ndarray, "rows channels"]
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ import pydantic
 from latticebench.bench.axes import Listed, Seeds
 from latticebench.bench.case import Case, Folders, Roots, Seed, Settings, plain
 from latticebench.bench.trials.laboratory.effects import ANY, ASKED, MOST_EFFECTS, NONE
-from latticebench.bench.trials.laboratory.instruments import ASKED as ASKED_KINDS
-from latticebench.bench.trials.laboratory.instruments import HELD_OUT, KINDS, Kind
+from latticebench.bench.trials.laboratory.instruments import EVERY_KIND, HELD_OUT, KINDS, Kind
 from latticebench.bench.trials.laboratory.judging import Finding, findings, residual, written
 from latticebench.bench.trials.laboratory.making import LabRecording, make_recording
 from latticebench.diagnosis.repair import diagnose, shortfalls
@@ -66,7 +65,7 @@ class Laboratory(Case):
         Raises:
             Skipped: none with these effects could be made.
         """
-        kinds: dict[str, Kind] = {kind: kind for kind in ASKED_KINDS}
+        kinds: dict[str, Kind] = {kind: kind for kind in EVERY_KIND}
         effects = None if self.effects == ANY else [] if self.effects == NONE else self.effects.split("+")
         try:
             return make_recording(self.seed, kinds.get(self.instrument), effects, sites=self.sites or None)
@@ -139,8 +138,8 @@ class Batch(Settings):
         groups: dict[str, tuple[Kind, ...]] = {"each": KINDS, "held-out": HELD_OUT}
         instruments = [kind for name in self.instruments for kind in groups.get(name, (name,))]
         for name in instruments:
-            if name not in (ANY, *ASKED_KINDS):
-                raise unknown("instrument", name, [ANY, *groups, *ASKED_KINDS], where)
+            if name not in (ANY, *EVERY_KIND):
+                raise unknown("instrument", name, [ANY, *groups, *EVERY_KIND], where)
         for text in self.effects:
             names = [] if text in (ANY, NONE) else text.split("+")
             for name in names:

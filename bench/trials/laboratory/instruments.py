@@ -24,7 +24,7 @@ KINDS: tuple[Kind, ...] = (
 )  # fmt: skip
 HELD_OUT: tuple[Kind, ...] = ("drifting-zero", "jittered-gaps")
 # All there are; those that are not among `KINDS` come only where they are asked for.
-ASKED: tuple[Kind, ...] = (*KINDS, *HELD_OUT, "shaken")
+EVERY_KIND: tuple[Kind, ...] = (*KINDS, *HELD_OUT, "shaken")
 QUIETEST, LOUDEST = 0.002, 0.05
 # Rounded times have so many values in an interval.
 DIGITS = 200
