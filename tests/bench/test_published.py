@@ -192,19 +192,20 @@ def test_the_page_on_the_diagnosis_says_what_the_table_of_recordings_that_lack_n
     later = nothing_missing(frame).iloc[0]
     assert later["no answer"] == 1
     assert f"was named in {share(later['false alarms'], digits=1)}, one more had no answer" in words("diagnosis")
-    third = pd.read_csv(RESULTS / "loop" / "nothing-missing-third" / "laboratory.csv", comment="#")
-    third = nothing_missing(third).iloc[0]
-    assert third["no answer"] == 0
-    exact = share(third["false alarms"], digits=1)
-    assert f"an effect was named in {exact}, and `unexplained` were " in words("diagnosis")
-    assert f"`unexplained` were {share(third['unexplained'], digits=1)}" in words("diagnosis")
-    fourth = nothing_missing(
-        pd.read_csv(RESULTS / "loop" / "nothing-missing-fourth" / "laboratory.csv", comment="#")
-    ).iloc[0]
-    assert fourth["no answer"] == 0
-    both = f"`results/loop/nothing-missing-fourth`) both are {share(fourth['false alarms'], digits=1)}."
-    assert both in words("diagnosis")
-    assert fourth["unexplained"] == fourth["false alarms"]
+    others = [
+        pd.read_csv(RESULTS / "loop" / f"nothing-missing-{which}" / "laboratory.csv", comment="#")
+        for which in ("third", "fourth", "fifth")
+    ]
+    each = nothing_missing(pd.concat(others)).set_index("instrument")
+    assert (each["no answer"] == 0).all()
+    exact = share(each.loc["all", "false alarms"], digits=1)
+    assert f"effect was named in {exact}, and `unexplained` were " in words("diagnosis")
+    assert f"`unexplained` were {share(each.loc['all', 'unexplained'], digits=1)}" in words("diagnosis")
+    counts = [one.split()[-1] for one in each.drop("all")["false alarms"]]
+    assert f"Each instrument has {min(counts)} to {max(counts)} of these" in words("diagnosis")
+    # At most one of each is at most 1 in the smallest count.
+    most = each.drop("all")[["false alarms", "unexplained"]].map(lambda one: float(one.split(" (")[0])).max().max()
+    assert most <= round(100 / int(min(counts)), 1)
     readme = " ".join((RESULTS.parent / "README.md").read_text(encoding="utf-8").split())
     assert f"it names something in {exact.split(' (')[0]} of {exact.split()[-1]} " in readme
 
