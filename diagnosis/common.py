@@ -14,8 +14,8 @@ has if it is taken to be correlated as the sensors' own noise is, by rho_1. In
 
     p_k - r_k p_(k-1),    r_k = rho_0 sqrt(K_k / K_(k-1)),
 
-where rho_0 is the correlation of y_0 over the interval, both are moving averages of two numbers: the covariance has
-three diagonals, and its Cholesky factor makes independent numbers f of these, in a time linear in their number. Then
+where rho_0 is the correlation of y_0 over the interval, both are moving averages of two numbers, of which `Averages`
+makes independent numbers f. Then
 
     e = (I - h h^T) z / d + h f
 
@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis.averages import Averages
 from latticebench.diagnosis.rows import CLOSEST, Rows, gaps
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ class Unmixing:
         return np.asarray(linked & np.concatenate([[False], ~linked[:-1]]))
 
     @functools.cached_property
-    def _averages(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    def _shares(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """r, the shares that the new and the last innovation of y_0 have in p_k - r_k p_(k-1), and rho_1."""
         rho, total = self.rho[self._there], self._total
         last = np.concatenate([total[:1], total[:-1]])
@@ -133,20 +134,16 @@ class Unmixing:
         return rho * np.sqrt(total / last), new, np.where(self._second, begun, own * new), own
 
     @functools.cached_property
-    def _factor(self) -> Float[ndarray, "two read"]:
-        """The two diagonals of the Cholesky factor L, as SciPy's banded matrices have them."""
-        from scipy.linalg import cholesky_banded
-
-        r, new, old, _ = self._averages
-        covariance = np.zeros((2, len(r)))
-        covariance[0] = 1 + r**2 + new**2 + old**2
-        covariance[1, :-1] = -(r[1:] + old[1:] * new[:-1])
-        return np.asarray(cholesky_banded(covariance, lower=True, check_finite=False)) if len(r) else covariance
+    def _averages(self) -> Averages:
+        """What makes p_k - r_k p_(k-1) independent."""
+        r, new, old, _ = self._shares
+        before = np.concatenate([[0.0], new[:-1]])
+        return Averages.of(1 + r**2 + new**2 + old**2, -(r + old * before))
 
     @property
     def log_scale(self) -> float:
         """Half the logarithm of the determinant of the covariance of z."""
-        return float(np.sum(np.log(self._factor[0])) - np.sum(self.seen @ np.log(np.cosh(self.numbers))))
+        return self._averages.log_scale - float(np.sum(self.seen @ np.log(np.cosh(self.numbers))))
 
     def apply(self, z: Grid) -> Grid:
         """Return independent innovations, or their derivatives (any further axes); z is 0 where nothing was read."""
@@ -166,12 +163,12 @@ class Unmixing:
 
         Those of `log_scale` are among the last three.
         """
-        there, h, total, (r, new, old, own) = self._there, self._along, self._total, self._averages
+        there, h, total, (r, new, old, own) = self._there, self._along, self._total, self._shares
         across, by_here = (z * np.cosh(self.numbers))[there], by_e[there]
         along, pull = np.sum(h * across, axis=1), np.sum(h * by_here, axis=1)
         fresh = self._fresh(along)
         by_p, by_difference = self._fresh_transposed(pull)
-        on, beside = self._by_covariance(fresh, by_difference)
+        on, beside = self._averages.slopes(fresh, by_difference)
         last, before = np.concatenate([total[:1], total[:-1]]), np.concatenate([[0.0], along[:-1]])
         by_r = 2 * r * on - beside - by_difference * before
         by_old = 2 * old * on - beside * np.concatenate([[0.0], new[:-1]])
@@ -198,26 +195,6 @@ class Unmixing:
         by_a = np.sum(by_w, axis=0) * np.cosh(self.numbers) + tilt
         return by_across * np.cosh(self.numbers), by_a, by_rows, by_owns
 
-    def _by_covariance(
-        self, fresh: Float[ndarray, " read"], by_difference: Float[ndarray, " read"]
-    ) -> tuple[Float[ndarray, " read"], Float[ndarray, " read"]]:
-        """Return derivatives by the diagonals of the covariance, from f and the derivatives by p_k - r_k p_(k-1).
-
-        L_kk^2 = C_kk - L_k,k-1^2 and L_k,k-1 = C_k,k-1 / L_k-1,k-1, followed backwards.
-        """
-        from scipy.linalg import solve_banded
-
-        size, beside = self._factor[0], np.concatenate([[0.0], self._factor[1, :-1]])
-        by_size = 1 / size - by_difference * fresh
-        by_beside = -by_difference * np.concatenate([[0.0], fresh[:-1]])
-        earlier = np.concatenate([size[:1], size[:-1]])
-        upper = np.ones((2, len(size)))
-        upper[0, 1:] = -(beside**2 / (size * earlier))[1:]
-        right = by_size.copy()
-        right[:-1] -= (by_beside * beside / earlier)[1:]
-        total = solve_banded((0, 1), upper, right, check_finite=False)
-        return total / (2 * size), (by_beside - total * beside / size) / earlier
-
     def _inner(self, x: Float[ndarray, "read some *more"]) -> Float[ndarray, "read *more"]:
         return np.asarray(np.einsum("rc,rc...->r...", self._along, x))
 
@@ -226,25 +203,15 @@ class Unmixing:
 
     def _fresh(self, along: Float[ndarray, "read *more"]) -> Float[ndarray, "read *more"]:
         """Return f from p."""
-        from scipy.linalg import solve_banded
-
-        if not len(along):
-            return along
         difference = along.copy()
-        difference[1:] -= _shaped(self._averages[0][1:], along, 0) * along[:-1]
-        return np.asarray(solve_banded((1, 0), self._factor, difference, check_finite=False))
+        difference[1:] -= _shaped(self._shares[0][1:], along, 0) * along[:-1]
+        return self._averages.apply(difference)
 
     def _fresh_transposed(self, f: Float[ndarray, "read *more"]) -> tuple[ndarray, ndarray]:
         """Return the transpose of that map applied to numbers, and of its last step alone."""
-        from scipy.linalg import solve_banded
-
-        if not len(f):
-            return f, f
-        upper = np.zeros_like(self._factor)
-        upper[0, 1:], upper[1] = self._factor[1, :-1], self._factor[0]
-        difference = np.asarray(solve_banded((0, 1), upper, f, check_finite=False))
+        difference = self._averages.transposed(f)
         found = difference.copy()
-        found[:-1] -= _shaped(self._averages[0][1:], f, 0) * difference[1:]
+        found[:-1] -= _shaped(self._shares[0][1:], f, 0) * difference[1:]
         return found, difference
 
 

@@ -298,8 +298,12 @@ def describe(
         if step > COARSE * size:
             parts.append(f"steps of {two_digits(step)}")
         if memory > 0:
-            near = f" ({two_digits(np.exp(-interval / memory))} from one reading to the next)" if interval else ""
-            parts.append(f"correlated over {two_digits(memory)} {time}".rstrip() + near)
+            slow = 1 - noise.white[number] if len(noise.white) else 1.0
+            near = (
+                f" ({two_digits(slow * np.exp(-interval / memory))} from one reading to the next)" if interval else ""
+            )
+            share = f"{two_digits(100 * slow)} % of its variance " if slow < 1 else ""
+            parts.append(f"{share}correlated over {two_digits(memory)} {time}".rstrip() + near)
         if span is not None and walk > 0:
             parts.append(f"a zero that wanders by {two_digits(walk * np.sqrt(span))} {unit}".rstrip())
         if noise.common is not None and noise.common.share[number] ** 2 > LEAST_COMMON:

@@ -6,7 +6,10 @@ for times that need not be even:
 
     y_k = rho_k y_(k-1) + sqrt(1 - rho_k^2) z_k,    rho_k = exp(-(t_k - t_(k-1)) / tau),
 
-and y = z at the first reading of a piece; an interval counts as at least `CLOSE` of the typical one. The innovations z
+and y = z at the first reading of a piece; an interval counts as at least `CLOSE` of the typical one. A share v of its
+variance may be white besides, as where an amplifier hisses and its zero comes and goes: then y_k - rho_k y_(k-1) are
+moving averages of two, of variance 1 - rho_k^2 + 2 v rho_k^2 and covariance -v rho_k with the one before (an ARMA(1, 1)
+process: Granger & Morris, J. R. Stat. Soc. A 139, 246, 1976), and z is what `Averages` makes of these. The innovations
 are independent and follow Student's t distribution with nu degrees of freedom (Lange, Little & Taylor, J. Am. Stat.
 Assoc. 84, 881, 1989), or the normal distribution. Which of these parts are used is the `Structure`; Schwarz' criterion
 (Ann. Stat. 6, 461, 1978) chooses it.
@@ -19,17 +22,18 @@ All likelihoods are natural logarithms with their normalising constants, so that
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis.averages import Averages
 from latticebench.diagnosis.common import Common, Unmixing
 from latticebench.diagnosis.rows import CLOSEST, Chained, Rows, chained
-from latticebench.diagnosis.walk import Walk
+from latticebench.diagnosis.walk import covariance
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
     from numpy import ndarray
 
     from latticebench.diagnosis.rows import Seen
@@ -48,6 +52,8 @@ class Structure:
         memory: the noise is correlated from one reading to the next.
         common: a part of it is common to all sensors; with sizes of their own, each has its share. Of two sensors their
             correlation is all that is seen, and the shares are alike.
+        white: with a memory, a part of it is white besides; not where there is something in common. An estimate with
+            this structure does without where it is not worth its numbers.
     """
 
     own_sizes: bool = False
@@ -55,11 +61,17 @@ class Structure:
     tails: bool = False
     memory: bool = False
     common: bool = False
+    white: bool = False
 
     def parameters(self, sensors: int) -> int:
         """Return how many numbers describe the noise of so many sensors."""
         groups = sensors if self.own_sizes else 1
-        return groups * (1 + self.memory) + self.growth + self.tails + self.common * (self.shares(sensors) + 1)
+        return (
+            groups * (1 + self.memory + self.white)
+            + self.growth
+            + self.tails
+            + self.common * (self.shares(sensors) + 1)
+        )
 
     def shares(self, sensors: int) -> int:
         """Return how many numbers say what so many sensors have in common."""
@@ -80,6 +92,7 @@ class Noise:
         walk: standard deviation of the walk of each zero after a unit of time (sensors,), in units of the readings;
             empty where no zero wanders.
         common: what the sensors have in common; None for nothing.
+        white: share v of the variance that is white where the rest has a memory (sensors,); empty for none.
     """
 
     size: Float[ndarray, " sensors"]
@@ -89,6 +102,7 @@ class Noise:
     structure: Structure
     walk: Float[ndarray, " sensors"] = field(default_factory=lambda: np.zeros(0))
     common: Common | None = None
+    white: Float[ndarray, " sensors"] = field(default_factory=lambda: np.zeros(0))
 
     @property
     def parameters(self) -> int:
@@ -102,6 +116,8 @@ class Noise:
     def fresh(self, step: float) -> Float[ndarray, " sensors"]:
         """Return the size of what is new after a time, in units of the readings."""
         new = _fresh(self.memory, step)
+        if len(self.white):
+            new = new + self.white * (1 - new)
         if self.common is not None:
             new = new + self.common.share**2 * (_fresh(np.array(self.common.memory), step) - new)
         return np.asarray(self.size * np.sqrt(new))
@@ -124,24 +140,29 @@ class Noise:
         size = np.hypot(self.size[chain.sensor], self.growth * np.abs(chain.of(level)))
         time = self.memory[chain.sensor]
         rho = np.where(time > 0, np.minimum(np.exp(-chain.gap / np.where(time > 0, time, 1.0)), 1 - CLOSEST), 0.0)
-        spread = np.sqrt(1 - rho**2)
+        white = self.white[chain.sensor] if len(self.white) else np.zeros_like(rho)
+        spread = np.where(white > 0, 1.0, np.sqrt(1 - rho**2))
         before = np.zeros_like(rho)
         before[1:] = rho[1:] / (spread[1:] * size[:-1])
-        own, log_scale = 1 / (size * spread), float(np.sum(np.log(size * spread)))
-        plain = Whitener(chain, seen, own, before, self.tail, log_scale)
+        own, log_size = 1 / (size * spread), np.log(size * spread)
+        where, averages = np.flatnonzero(white > 0), None
+        variance, beside = 1 - rho**2 + 2 * white * rho**2, -white * rho
+        if np.any(self.walk):
+            some = np.flatnonzero(self.walk[chain.sensor] > 0)
+            linked = np.isfinite(chain.gap[some])
+            gap = np.where(linked, chain.gap[some], chain.time[some] - np.min(rows.times))
+            variance[some], beside[some] = covariance(size[some], self.walk[chain.sensor[some]], gap, linked)
+            own[some], before[some], log_size[some] = 1.0, linked, 0.0
+            where = np.union1d(where, some)
+        log_scale = float(np.sum(log_size))
+        if len(where):
+            averages = Averages.of(variance[where], beside[where])
+            log_scale += averages.log_scale
+        mixed: tuple[Unmixing, ...] = ()
         if self.common is not None:
             mixed = tuple(self.common.unmixings(rows, seen, chain.grid(rho, seen)))
             log_scale += sum(one.log_scale for one in mixed)
-            plain = replace(plain, log_scale=log_scale, mixed=mixed)
-        if not np.any(self.walk):
-            return plain
-        where = np.flatnonzero(self.walk[chain.sensor] > 0)
-        linked = np.isfinite(chain.gap[where])
-        time = np.where(linked, chain.gap[where], chain.time[where] - np.min(rows.times))
-        walk = Walk.of(where, size[where], self.walk[chain.sensor[where]], time, linked)
-        alone = float(np.sum(np.log(size[where] * spread[where])))
-        own[where], before[where] = 1.0, linked
-        return replace(plain, log_scale=log_scale - alone + walk.log_scale, walk=walk)
+        return Whitener(chain, seen, own, before, self.tail, log_scale, mixed, where, averages)
 
     def still(self, left: Readings, level: Readings, rows: Rows) -> Readings:
         """Return residuals without the walks of zeros, as far as these can be told from the rest of the noise.
@@ -162,17 +183,16 @@ class Whitener:
     """A linear map from residuals to innovations in units of their size.
 
     z_k = (x_k / s_k - rho_k x_p / s_p) / sqrt(1 - rho_k^2), where p is the last reading that was seen of the same
-    channel in the same piece; x / s at the first of a piece. Where a zero wanders these are differences x_k - x_p, and
-    `walk` makes innovations of them.
+    channel in the same piece; x / s at the first of a piece. Where a part of the noise is white it is x_k / s_k - rho_k
+    x_p / s_p, where a zero wanders x_k - x_p, and `averages` makes innovations of these.
 
     Attributes:
         seen: where there are readings (rows, channels).
         own, before: factors of each reading of the chain and of the one before it, 0 where there is none.
         tail: degrees of freedom of Student's t.
-        log_scale: sum of the logarithms of the innovations' sizes s_k sqrt(1 - rho_k^2); with what is common and walks,
-            half the logarithm of the determinant of the residuals' covariance.
+        log_scale: half the logarithm of the determinant of the residuals' covariance.
         mixed: what makes independent innovations where sensors have something in common.
-        walk: what makes innovations of the differences of readings whose zeros wander.
+        where, averages: which readings of the chain are moving averages, and what makes innovations of these.
     """
 
     chain: Chained
@@ -181,8 +201,9 @@ class Whitener:
     before: Float[ndarray, " readings"]
     tail: float
     log_scale: float
-    mixed: tuple[Unmixing, ...] = ()
-    walk: Walk | None = None
+    mixed: tuple[Unmixing, ...]
+    where: Int[ndarray, " averages"]
+    averages: Averages | None
 
     def apply(self, x: Float[ndarray, "rows channels *more"]) -> Float[ndarray, "rows channels *more"]:
         """Return the innovations of residuals or of their derivatives (any further axes), 0 where nothing was seen."""
@@ -191,8 +212,8 @@ class Whitener:
         z = values * self.own[:, None]
         if np.any(self.before):
             z[1:] -= values[:-1] * self.before[1:, None]
-        if self.walk is not None:
-            z[self.walk.where] = self.walk.apply(z[self.walk.where])
+        if self.averages is not None:
+            z[self.where] = self.averages.apply(z[self.where])
         found = self.chain.grid(z, self.seen)
         for one in self.mixed:
             found[:, one.some] = one.apply(found[:, one.some])
@@ -207,8 +228,8 @@ class Whitener:
         for one in self.mixed:
             whole[:, one.some] = one.transposed(whole[:, one.some])
         values = self.chain.of(whole)
-        if self.walk is not None:
-            values[self.walk.where] = self.walk.transposed(values[self.walk.where])
+        if self.averages is not None:
+            values[self.where] = self.averages.transposed(values[self.where])
         x = values * self.own[:, None]
         if np.any(self.before):
             x[:-1] -= values[1:] * self.before[1:, None]

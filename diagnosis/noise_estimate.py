@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from latticebench.diagnosis import rules
+from latticebench.diagnosis.averages import Averages
 from latticebench.diagnosis.common import Common
 from latticebench.diagnosis.common_estimate import MOST, Beside
 from latticebench.diagnosis.noise import Noise, Structure, minus_log_density
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
     from latticebench.diagnosis.noise import Readings
+
+    Each = Float[ndarray, " readings"]
 
 # A size is at least this share of the level's root mean square: arithmetic with doubles is no more accurate.
 FLOOR = 1e-12
@@ -33,8 +35,13 @@ LIGHTEST = 1000.0
 # Correlations from one typical reading to the next. A stronger one than the largest may stand for any slow misfit of
 # the equation, which the equation should have to answer for; below the least, the noise is white.
 MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
-# Nats that each part of the structure but `common` must win beyond Schwarz' penalty. Five parts are tried, on records
-# of less than a hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100 records.
+# The largest share that is white where the rest of the noise is slow: with all of it there would be no rest.
+MOST_WHITE = 0.999
+# Slow noise is seen in the means of so many readings.
+BLOCKS = (4, 16, 64)
+# Nats that each part of the structure but `white` and `common` must win beyond Schwarz' penalty. Five parts are tried,
+# on records of less than a hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100
+# records.
 MARGIN = 2.0
 # Readings that the structure is chosen from, in stretches all over a longer record: what so many do not show changes
 # sizes by less than a per cent.
@@ -67,14 +74,14 @@ def estimate(
     plain = np.where(apart, np.nan, left) if np.any(apart) and others else left
     if structure is not None and rows.walking and not others:
         # Where all zeros wander, growth, tails and what is common are not told from the walks.
-        structure = replace(structure, growth=False, tails=False, common=False)
+        structure = replace(structure, growth=False, tails=False, white=False, common=False)
     if structure is None:
         start = _chosen(_Task.of(*_glance(plain, level, rows)), common)
         structure = start.structure
     if plain is left:
         found = task.best(structure, start)[0]
     else:
-        found = task.lent(_Task.of(plain, level, rows).best(structure, start)[0], rows.curved)
+        found = task.lent(_Task.of(plain, level, rows).best(structure, start)[0], left, level, rows)
     if rows.walking:
         found = walked(found, left, level, rows, start)
     everything, taken = len(task.value), float(np.sum(free))
@@ -105,7 +112,7 @@ def _chosen(task: _Task, common: bool) -> Noise:
     later be done better by another.
     """
     tried: dict[Structure, tuple[float, Noise]] = {}
-    each = np.log(max(len(task.value), 1)) / 2
+    each = task.each
     # The common part takes long to fit: it is left alone where it is far from worth its two numbers.
     alone = not common or "common" not in task.possible or task.beside.promises(task.value) < each + rules.IN_COMMON / 2
     parts = [part for part in task.possible if part != "common" or not alone]
@@ -113,7 +120,8 @@ def _chosen(task: _Task, common: bool) -> Noise:
     def price(structure: Structure, near: Noise | None) -> float:
         if structure not in tried:
             noise, likelihood = task.best(structure, near)
-            margins = MARGIN * (sum(vars(structure).values()) - structure.common) + rules.IN_COMMON * structure.common
+            margins = MARGIN * (sum(vars(structure).values()) - structure.white - structure.common)
+            margins += rules.BESIDE_WHITE * structure.white + rules.IN_COMMON * structure.common
             tried[structure] = each * noise.parameters + margins - likelihood, noise
         return tried[structure][0]
 
@@ -143,11 +151,11 @@ class _Task:
         possible: parts of a structure that can make a difference.
     """
 
-    value: Float[ndarray, " readings"]
-    level: Float[ndarray, " readings"]
+    value: Each
+    level: Each
     sensor: Int[ndarray, " readings"]
     beside: Beside
-    gap: Float[ndarray, " readings"]
+    gap: Each
     linked: Bool[ndarray, " readings"]
     even: bool
     unit: float
@@ -171,13 +179,18 @@ class _Task:
         beside = Beside.of(chain, rows, np.isfinite(left), interval)
         ways = {
             "own_sizes": sensors > 1, "growth": height > 0, "tails": True, "memory": bool(np.any(apart)),
-            "common": beside.several,
+            "white": bool(np.any(apart)), "common": beside.several,
         }  # fmt: skip
         even = bool(np.all(np.abs(gap[linked] - 1) < 1e-6))
         return cls(
             value / unit, heights / unit, chain.sensor, beside, gap, linked, even, unit, interval, floor / unit,
             sensors, tuple(part for part, there in ways.items() if there),
         )  # fmt: skip
+
+    @property
+    def each(self) -> float:
+        """Schwarz' penalty for a number, in nats."""
+        return float(np.log(max(len(self.value), 1))) / 2
 
     def is_exact(self) -> bool:
         """Whether the residuals are no more than what arithmetic leaves."""
@@ -190,12 +203,53 @@ class _Task:
         return np.zeros_like(self.sensor), 1
 
     def best(self, structure: Structure, start: Noise | None) -> tuple[Noise, float]:
-        """Return the noise of greatest likelihood with a given structure, and its log likelihood."""
+        """Return the noise of greatest likelihood with a given structure, and its log likelihood.
+
+        A part is white besides a slow one only where that is worth its numbers: both together do the work of weak
+        forces.
+        """
+        plain, likelihood = self.likeliest(replace(structure, white=False), start)
+        if not structure.white or self.is_exact():
+            return plain, likelihood
+        price = self.each * (structure.parameters(self.sensors) - plain.parameters) + rules.BESIDE_WHITE
+        if plain.structure.common or self.unsettled(plain) < price / 2:
+            return plain, likelihood
+        both, higher = self.likeliest(structure, start if start is not None and len(start.white) else plain)
+        return (both, higher) if higher > likelihood + price else (plain, likelihood)
+
+    def unsettled(self, noise: Noise) -> float:
+        """Return about how many nats slow noise may be worth besides: what means of innovations vary too much for.
+
+        Means of m independent numbers of size 1 have the variance 1 / m; if that of k of them is q times as much, the
+        likelihoods of both differ by k (q - 1 - ln q) / 2.
+        """
+        group, groups = self.groups(noise.structure)
+        size = (noise.size if noise.structure.own_sizes else noise.size[:1]) / self.unit
+        time = (noise.memory if noise.structure.own_sizes else noise.memory[:1]) / self.interval
+        near = np.where(time > 0, np.exp(-1 / np.where(time > 0, time, 1.0)), 0.0)
+        *_, z = self.apart(size[group], noise.growth, near[group], white=False)
+        begin = np.flatnonzero(~self.linked)
+        place = np.arange(len(z)) - np.repeat(begin, np.diff(begin, append=len(z)))
+        most = np.zeros(groups)
+        for many in BLOCKS:
+            first = np.flatnonzero(place % many == 0)
+            whole = np.diff(first, append=len(z)) == many
+            mean, of = np.add.reduceat(z, first)[whole] / many, group[first[whole]]
+            count = np.bincount(of, minlength=groups)
+            each = np.bincount(group, z**2, minlength=groups) / np.maximum(np.bincount(group, minlength=groups), 1)
+            ratio = many * np.bincount(of, mean**2, minlength=groups) / np.maximum(count * each, 1e-300)
+            nats = np.where(ratio > 1, count * (ratio - 1 - np.log(np.maximum(ratio, 1.0))) / 2, 0.0)
+            most = np.maximum(most, nats)
+        return float(np.sum(most))
+
+    def likeliest(self, structure: Structure, start: Noise | None) -> tuple[Noise, float]:
+        """Return the noise of greatest likelihood with all parts of a structure, and its log likelihood."""
         from scipy.optimize import minimize
 
         structure = replace(structure, **{part: False for part in vars(structure) if part not in self.possible})
         if structure.common and self.beside.ragged:
             structure = replace(structure, memory=False)
+        structure = replace(structure, white=structure.white and structure.memory and not structure.common)
         plain = self.plain(structure)
         if not len(self.value):
             return plain, 0.0
@@ -209,6 +263,7 @@ class _Task:
             bounds += [(np.log(1e-6), np.log(1e6))] * structure.growth
             bounds += [(1 / LIGHTEST, 1 / HEAVIEST)] * structure.tails
             bounds += [(LEAST_CORRELATED, MOST_CORRELATED)] * (groups * structure.memory)
+            bounds += [(0.0, MOST_WHITE)] * (groups * structure.white)
             bounds += [(LEAST_CORRELATED, MOST_CORRELATED)] * structure.common
             bounds += [(-MOST, MOST)] * (structure.shares(self.sensors) * structure.common)
             result = minimize(
@@ -218,9 +273,9 @@ class _Task:
             found, cost = self.unpacked(np.asarray(result.x), structure), float(result.fun)
         return found, -len(self.value) * (cost + float(np.log(self.unit)))
 
-    def lent(self, noise: Noise, curved: Collection[int]) -> Noise:
+    def lent(self, noise: Noise, left: Readings, level: Readings, rows: Rows) -> Noise:
         """Return the noise of all sensors, of which some have a size of their own and all else from the others."""
-        borrows = np.isin(np.arange(self.sensors), list(curved))
+        borrows = np.isin(np.arange(self.sensors), list(rows.curved))
         if noise.common is not None:
             known = ~borrows & (noise.common.share != 0)
             mean = np.mean(noise.common.share[known]) if np.any(known) else 0.0
@@ -229,25 +284,13 @@ class _Task:
         if not noise.structure.own_sizes:
             return noise
         memory = np.where(borrows, np.mean(noise.memory[~borrows]), noise.memory)
+        white = np.where(borrows, np.mean(noise.white[~borrows]), noise.white) if len(noise.white) else noise.white
         first = self.plain(noise.structure).size / (np.sqrt(2) if np.isfinite(noise.tail) else 1.0)
-        found = replace(noise, size=np.where(borrows, first, noise.size), memory=memory)
+        found = replace(noise, size=np.where(borrows, first, noise.size), memory=memory, white=white)
         for _ in range(LENT):
-            size = np.maximum(found.size * np.sqrt(self.excess(found)), self.floor * self.unit)
+            size = np.maximum(found.size * np.sqrt(_excess(found, left, level, rows)), self.floor * self.unit)
             found = replace(found, size=np.where(borrows, size, noise.size))
         return found
-
-    def excess(self, noise: Noise) -> Float[ndarray, " sensors"]:
-        """Return by how much the variance of each sensor's innovations is beyond that of the noise, weighed by it."""
-        s = np.hypot(noise.size[self.sensor] / self.unit, noise.growth * self.level)
-        time = noise.memory[self.sensor] / self.interval
-        rho = np.where(self.linked & (time > 0), np.exp(-self.gap / np.where(time > 0, time, 1.0)), 0.0)
-        rho = np.minimum(rho, 1 - CLOSEST)
-        y = self.value / s
-        z = (y - rho * np.concatenate([[0.0], y[:-1]])) / np.sqrt(1 - rho**2)
-        square = z**2 if not np.isfinite(noise.tail) else (noise.tail + 1) * z**2 / (noise.tail + z**2)
-        count = np.bincount(self.sensor, minlength=self.sensors)
-        mean = np.bincount(self.sensor, square, minlength=self.sensors) / np.maximum(count, 1)
-        return np.where(mean > 0, mean, 1.0)
 
     def least(self, structure: Structure) -> list[float]:
         """Return the least size of each group, divided by `unit`.
@@ -275,7 +318,7 @@ class _Task:
         """Return noise as numbers to vary: log sizes, log growth, 1 / nu, correlations over the typical interval.
 
         Last come that of the common part, and how much of it the sensors have.
-        Sizes are those of what is new in a reading, which has a floor: size * sqrt(1 - correlation^2).
+        Sizes are those of what is new in a reading, which has a floor: size * sqrt(1 - (1 - white) correlation^2).
         Parts of the structure that the noise does not have get a start of their own; with growth, half of the variance.
         """
         size = noise.size if noise.structure.own_sizes or not structure.own_sizes else self.plain(structure).size
@@ -294,11 +337,10 @@ class _Task:
             size = size if known else size / np.sqrt(2)
             numbers.append(np.array([1 / noise.tail if known else 0.2]))
         if structure.memory:
-            time = noise.memory if structure.own_sizes else np.mean(noise.memory, keepdims=True)
-            time = np.where(time > 0, time, self.interval)
-            rho = np.clip(np.exp(-self.interval / time), LEAST_CORRELATED, MOST_CORRELATED)
-            size = np.maximum(size * np.sqrt(1 - rho**2), self.floor)
-            numbers.append(rho)
+            correlated = self.correlated(noise, structure)
+            white = correlated[1] if structure.white else 0.0
+            size = np.maximum(size * np.sqrt(1 - (1 - white) * correlated[0] ** 2), self.floor)
+            numbers += correlated
         if structure.common:
             shares, known = structure.shares(self.sensors), noise.common
             near = np.exp(-self.interval / (known.memory or 1e-9 * self.interval)) if known else np.exp(-1)
@@ -307,11 +349,30 @@ class _Task:
             numbers.append(begun if known is None else self.beside.reduced(known.share, shares, np.tanh(MOST)))
         return np.concatenate([np.log(size), *numbers])
 
+    def correlated(self, noise: Noise, structure: Structure) -> list[Float[ndarray, " groups"]]:
+        """Return correlations over the typical interval, and where a part is white its share of the variance.
+
+        Where it is not known yet, it is such that the noise correlates over one interval as it is known to.
+        """
+        known = len(noise.white) > 0
+        every = (noise.memory, noise.white if known else np.zeros(self.sensors))
+        time, white = (one if structure.own_sizes else np.mean(one, keepdims=True) for one in every)
+        rho = np.exp(-self.interval / np.where(time > 0, time, self.interval))
+        if structure.white and not known:
+            rho = np.sqrt(rho)
+            white = 1 - rho
+        if known and not structure.white:
+            rho = (1 - white) * rho
+        rho = np.clip(rho, LEAST_CORRELATED, MOST_CORRELATED)
+        return [rho, np.minimum(white, MOST_WHITE)] if structure.white else [rho]
+
     def unpacked(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> Noise:
         """Return the noise that numbers of `packed` stand for."""
-        size, growth, tail, rho, near, shares = self.parts(numbers, structure)
-        everyone = np.ones(self.sensors)
-        found = Noise(size * self.unit * everyone, growth, tail, self.time(rho) * everyone, structure)
+        size, growth, tail, rho, white, near, shares = self.parts(numbers, structure)
+        everyone, time = np.ones(self.sensors), self.time(rho)
+        found = Noise(size * self.unit * everyone, growth, tail, time * everyone, structure)
+        if structure.white:
+            found = replace(found, white=np.where(time > 0, white, 0.0) * everyone)
         if not structure.common:
             return found
         read = np.bincount(self.sensor, minlength=self.sensors) > 0
@@ -323,42 +384,66 @@ class _Task:
 
     def parts(
         self, numbers: Float[ndarray, " numbers"], structure: Structure
-    ) -> tuple[ndarray, float, float, ndarray, float, ndarray]:
-        """Return sizes, growth, degrees of freedom, correlations over the typical interval.
+    ) -> tuple[ndarray, float, float, ndarray, ndarray, float, ndarray]:
+        """Return sizes, growth, degrees of freedom, correlations over the typical interval, and white shares.
 
-        Last come that of the common part, and a of each sensor.
+        Last come the correlation of the common part, and a of each sensor.
         """
         groups = self.groups(structure)[1]
         new, rest = np.exp(numbers[:groups]), list(numbers[groups:])
         growth = float(np.exp(rest.pop(0))) if structure.growth else 0.0
         tail = float(1 / rest.pop(0)) if structure.tails else np.inf
         rho, rest = (np.array(rest[:groups]), rest[groups:]) if structure.memory else (np.zeros(groups), rest)
+        white, rest = (np.array(rest[:groups]), rest[groups:]) if structure.white else (np.zeros(groups), rest)
         near, shares = (rest[0], np.array(rest[1:])) if structure.common else (0.0, np.zeros(self.sensors))
         if structure.common and len(shares) == 1:
             shares = shares * self.beside.signed(shares[0])
-        return new / np.sqrt(1 - rho**2), growth, tail, rho, near, shares
+        size = new / np.sqrt(1 - (1 - white) * rho**2)
+        return size, growth, tail, rho, white, near, shares
+
+    def apart(self, size: Each, growth: float, near: Each, *, white: bool) -> tuple[Each, Each, Each, Each, Each, Each]:
+        """Return sizes, residuals over these, those before, correlations, factors, and innovations.
+
+        Args:
+            size: at zero signal, of each reading.
+            growth: with the signal.
+            near: correlation over the typical interval, of each reading.
+            white: whether part of the noise is white, so that these are moving averages.
+        """
+        s = np.sqrt(size**2 + (growth * self.level) ** 2) if growth else size
+        y, rho = self.value / s, np.zeros_like(self.value)
+        if np.any(near):
+            rho = np.where(self.linked, near if self.even else near**self.gap, 0.0)
+            rho = np.minimum(rho, 1 - CLOSEST)
+        q = np.ones_like(y) if white else 1 / np.sqrt(1 - rho**2)
+        before = np.concatenate([[0.0], y[:-1]])
+        return s, y, before, rho, q, (y - rho * before) * q
 
     def cost(self, numbers: Float[ndarray, " count"], structure: Structure) -> tuple[float, Float[ndarray, " count"]]:
         """Return minus the mean log likelihood of a reading, and its gradient."""
-        size, growth, tail, near, common, shares = self.parts(numbers, structure)
+        size, growth, tail, near, white, common, shares = self.parts(numbers, structure)
         group, groups = self.groups(structure)
-        s = np.sqrt(size[group] ** 2 + (growth * self.level) ** 2) if structure.growth else size[group]
-        y = self.value / s
-        rho = np.zeros_like(y)
-        if structure.memory:
-            rho = np.where(self.linked, near[group] if self.even else near[group] ** self.gap, 0.0)
-            rho = np.minimum(rho, 1 - CLOSEST)
-        q = 1 / np.sqrt(1 - rho**2)
-        before = np.concatenate([[0.0], y[:-1]])
-        z = (y - rho * before) * q
+        s, y, before, rho, q, z = self.apart(size[group], growth, near[group], white=structure.white)
+        e = z
         mixed = self.beside.unmixings(shares, common, rho) if structure.common else []
-        e = self.beside.apply(mixed, z) if mixed else z
+        averages = None
+        if mixed:
+            e = self.beside.apply(mixed, z)
+        elif structure.white:
+            v = white[group]
+            averages = Averages.of(1 - rho**2 + 2 * v * rho**2, -v * rho)
+            e = averages.apply(z)
         slope = e if not structure.tails else (tail + 1) * e / (tail + e**2)
         cost = np.sum(np.log(s)) - np.sum(np.log(q)) + minus_log_density(e, tail)
-        cost += sum(one.log_scale for one in mixed)
-        by_own = np.zeros_like(z)
+        cost += sum(one.log_scale for one in mixed) + (averages.log_scale if averages else 0.0)
+        by_own = by_white = np.zeros_like(z)
         if mixed:
             slope, by_share, by_common, by_own = self.beside.slopes(mixed, z, slope, common)
+        elif averages:
+            slope = averages.transposed(slope)
+            by_variance, by_beside = averages.slopes(e, slope)
+            by_white = 2 * rho**2 * by_variance - rho * by_beside
+            by_own = (4 * v - 2) * rho * by_variance - v * by_beside
         # By y of each reading, which its own innovation and the next one depend on.
         by_y = slope * q
         by_y[:-1] -= (slope * q * rho)[1:]
@@ -370,9 +455,13 @@ class _Task:
         if structure.tails:
             gradient.append(np.array([-(tail**2) * _by_tail(e, tail)]))
         if structure.memory:
-            by_rho = slope * (rho * q * z - before) * q - rho * q**2 + by_own
+            narrow = 0.0 if structure.white else 1.0
+            by_rho = by_own - slope * before * q + narrow * (slope * rho * q * z - rho * q) * q
             by_near = by_rho * rho * np.where(self.linked, self.gap, 0.0) / near[group]
-            gradient.append(np.bincount(group, by_near, minlength=groups) + gradient[0] * near / (1 - near**2))
+            wider = gradient[0] / (1 - (1 - white) * near**2)
+            gradient.append(np.bincount(group, by_near, minlength=groups) + wider * (1 - white) * near)
+        if structure.white:
+            gradient.append(np.bincount(group, by_white, minlength=groups) - wider * near**2 / 2)
         if mixed:
             one = structure.shares(self.sensors) == 1
             by_shares = np.array([self.beside.signed(numbers[-1]) @ by_share]) if one else by_share
@@ -380,7 +469,17 @@ class _Task:
         return float(cost) / len(y), np.concatenate(gradient) / len(y)
 
 
-def _by_tail(z: Float[ndarray, " readings"], tail: float) -> float:
+def _excess(noise: Noise, left: Readings, level: Readings, rows: Rows) -> Float[ndarray, " sensors"]:
+    """Return by how much the variance of each sensor's innovations is beyond that of the noise, weighed by it."""
+    whitener, sensors = noise.whitener(level, rows, np.isfinite(left)), len(noise.size)
+    z = whitener.apply(np.where(whitener.seen, left, 0.0))
+    square = np.sum((whitener.robust(z) * z) ** 2, axis=0)
+    count = np.bincount(rows.sensor, np.sum(whitener.seen, axis=0), minlength=sensors)
+    mean = np.bincount(rows.sensor, square, minlength=sensors) / np.maximum(count, 1)
+    return np.where(mean > 0, mean, 1.0)
+
+
+def _by_tail(z: Each, tail: float) -> float:
     """Return the derivative of `minus_log_density` by the degrees of freedom."""
     from scipy.special import digamma
 

@@ -23,9 +23,10 @@ def shown(problem: Problem, fitted: Fitted) -> tuple[Structure, float]:
     followed = fitted.followed
     noise = estimate(followed.left, followed.swing, fitted.rows)
     found, few = noise.structure, len(fitted.rms) <= FEW_SENSORS
-    growth = found.growth and beyond(problem, fitted) < NEAR
-    structure = replace(found, growth=growth, own_sizes=found.own_sizes or few, memory=found.memory or few)
-    return structure, float(np.mean(noise.memory))
+    growth, memory = found.growth and beyond(problem, fitted) < NEAR, found.memory or few
+    structure = replace(found, growth=growth, own_sizes=found.own_sizes or few, memory=memory, white=memory)
+    # Beside white noise, what is slow hardly matters to a curve.
+    return structure, 0.0 if np.any(noise.white) else float(np.mean(noise.memory))
 
 
 def hides(noise: Noise, step: float) -> bool:
@@ -35,4 +36,4 @@ def hides(noise: Noise, step: float) -> bool:
 
 def white(noise: Noise) -> Noise:
     """Return the noise without what may hide an effect."""
-    return replace(noise, memory=0 * noise.memory, common=None)
+    return replace(noise, memory=0 * noise.memory, white=np.zeros(0), common=None)

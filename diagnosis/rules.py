@@ -83,6 +83,9 @@ PUSHED = 1.0
 # Nats that a part of the noise which all sensors have in common must win beyond Schwarz' penalty (Ann. Stat. 6, 461,
 # 1978): without it a camera that shakes is a force on all sites, and with it a misfit could pass for noise.
 IN_COMMON = 2.0
+# Nats that a white part of the noise beside a slow one must win beyond Schwarz' penalty: a zero that comes and goes
+# beside an amplifier's hiss is no force, but both together could do the work of a weak one.
+BESIDE_WHITE = 2.0
 # A forecast is worse where its error grows by more than this share of itself and is more than so many times the noise:
 # with fewer readings every number more costs a little.
 WORSE, BEYOND_NOISE = 0.05, 2.0

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis.averages import Averages
 from latticebench.diagnosis.noise import Noise, minus_log_density
 from latticebench.diagnosis.rows import Rows, chained
-from latticebench.diagnosis.walk import Walk
+from latticebench.diagnosis.walk import covariance
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -47,7 +48,8 @@ def walked(noise: Noise, left: Readings, level: Readings, rows: Rows, start: Noi
     if common is not None:
         alone = np.isin(np.arange(len(size)), list(rows.walking))
         common = replace(common, share=np.where(alone, 0.0, common.share))
-    return replace(noise, size=size, memory=memory, walk=walk, common=common)
+    white = np.where(memory > 0, noise.white, 0.0) if len(noise.white) else noise.white
+    return replace(noise, size=size, memory=memory, white=white, walk=walk, common=common)
 
 
 def won_by_walking(noise: Noise, left: Readings, level: Readings, rows: Rows, sensors: Collection[int]) -> ndarray:
@@ -125,6 +127,6 @@ class _Task:
         plain = float(np.exp(numbers[0])) * self.unit
         walk = np.full(len(self.differences), np.exp(numbers[1] / 2) / np.sqrt(self.interval) * plain)
         size = np.hypot(plain, self.grown)
-        factor = Walk.of(np.arange(len(size)), size, walk, self.time, self.linked)
-        z = factor.apply(self.differences)
-        return (factor.log_scale + minus_log_density(z, self.tail)) / len(z)
+        averages = Averages.of(*covariance(size, walk, self.time, self.linked))
+        z = averages.apply(self.differences)
+        return (averages.log_scale + minus_log_density(z, self.tail)) / len(z)

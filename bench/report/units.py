@@ -162,7 +162,7 @@ def noise_in_words(
         own = slice(begin, begin + sites)
         size, walk = noise.size[own] / abs(units.scale), noise.walk[own] / abs(units.scale)
         common = None if noise.common is None else replace(noise.common, share=noise.common.share[own])
-        part = replace(noise, size=size, memory=noise.memory[own], walk=walk, common=common)
+        part = replace(noise, size=size, memory=noise.memory[own], white=noise.white[own], walk=walk, common=common)
         unit = units.reading if begin == 0 else rate_of(units.reading, units.time)
         grid = [step / abs(units.scale) for step in steps[own]]
         told = describe(part, grid, unit, interval=interval, time=units.time, span=span)

@@ -46,7 +46,7 @@ OFF: Mapping[str, Any] = {
     "MOST_EFFECTS": 100, "EQUAL": NEVER, "SLOWER": ALWAYS, "PERIODS": NEVER, "FIRST_HORIZON": 1e6, "MOVES": ALWAYS,
     "AT_ONCE": NEVER, "FASTER": rules.GROWTH, "ALMOST": 1.0, "BORDER": 1e6, "LOST": ALWAYS, "FOLLOWED": NEVER,
     "SHARE": NEVER, "SHARE_TIMED": NEVER, "REPELLING": NEVER, "DISPLACED": NEVER, "PLAINER": NEVER, "LEANER": NEVER,
-    "PUSHED": NEVER, "IN_COMMON": ALWAYS, "WORSE": ALWAYS, "BEYOND_NOISE": NEVER,
+    "PUSHED": NEVER, "IN_COMMON": ALWAYS, "BESIDE_WHITE": ALWAYS, "WORSE": ALWAYS, "BEYOND_NOISE": NEVER,
 }  # fmt: skip
 # Numbers that only mean something as they are, or that are gone with another one.
 NEITHER = {"STAND_INS"}
@@ -61,6 +61,8 @@ KINDS_OF_RECORDINGS = {
     "mains": "laboratory recordings of two sites with damping, one of whose sensors has mains in its cable: as missing",
     "shaken": "laboratory recordings of two or three sites and a shaking camera, every other one with nothing missing: "
     "as missing, or as nothing",
+    "slow": "laboratory recordings of one to three sites with white and slow noise, every other one with nothing "
+    "missing: as missing, or as nothing",
     "unnamed": "short recordings of 25 sites with an effect that has no name: the verdict says that something is left",
     "relaxing": "short recordings of a Ginzburg-Landau lattice of 25 sites, one effect missing: it alone is named",
     "measured": "measured recordings: the effects that are known to be there are named, and the forecast is not worse",
@@ -75,6 +77,7 @@ SEEDS = {
     "bent": range(36000, 36016),
     "mains": range(39000, 39016),
     "shaken": range(42000, 42016),
+    "slow": range(43000, 43016),
 }
 SITES = (1, 2, 3)
 # What is missing where a sensor is bent, and where one has mains.
@@ -129,6 +132,11 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
                                          effects="none" if place % 2 else "any"))
         for place, seed in enumerate(SEEDS["shaken"])
     ]  # fmt: skip
+    found += [
+        ("slow", str(seed), Laboratory(seed=seed, sites=SITES[place // 2 % len(SITES)], instrument="slow",
+                                       effects="none" if place % 2 else "any"))
+        for place, seed in enumerate(SEEDS["slow"])
+    ]  # fmt: skip
     for seed in SEEDS["unnamed"]:
         trials = [(name, Trial(system="phi4", effect=name, z=30.0, seed=seed)) for name in [*FIFTH_BLIND][::EVERY]]
         found += [("unnamed", f"{name} {seed}", trial) for name, trial in trials]
@@ -144,9 +152,9 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
 
 def judged(kind: str, name: str, result: Mapping[str, Any]) -> dict[str, Any]:
     """Return the verdict, what was named, and whether that is right."""
-    if kind in ("missing", "nothing", "wandering", "bent", "mains", "shaken"):
+    if kind in ("missing", "nothing", "wandering", "bent", "mains", "shaken", "slow"):
         row = laboratory.table([result]).iloc[0]
-        right = row["right"] and not (kind in ("nothing", "shaken") and row["verdict"] == "unexplained")
+        right = row["right"] and not (kind in ("nothing", "shaken", "slow") and row["verdict"] == "unexplained")
         return {"truth": row["truth"], "verdict": row["verdict"], "named": row["named"], "right": right}
     if kind in ("unnamed", "relaxing"):
         row = scores.table([result]).iloc[0]

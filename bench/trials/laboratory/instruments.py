@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 Kind = Literal[
     "white", "heavy-tailed", "coloured", "coarse", "proportional", "unequal", "spikes", "gaps", "drifting-zero",
-    "jittered-gaps", "shaken",
+    "jittered-gaps", "shaken", "slow",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = (
     "white", "heavy-tailed", "coloured", "coarse", "proportional", "unequal", "spikes", "gaps",
 )  # fmt: skip
 HELD_OUT: tuple[Kind, ...] = ("drifting-zero", "jittered-gaps")
 # All there are; those that are not among `KINDS` come only where they are asked for.
-EVERY_KIND: tuple[Kind, ...] = (*KINDS, *HELD_OUT, "shaken")
+EVERY_KIND: tuple[Kind, ...] = (*KINDS, *HELD_OUT, "shaken", "slow")
 QUIETEST, LOUDEST = 0.002, 0.05
 # Rounded times have so many values in an interval.
 DIGITS = 200
@@ -41,7 +41,8 @@ class Instrument:
         level: noise of the sensors over the RMS of the readings about their means (the step of a coarse converter: over
             the same).
         each: noise of each sensor over `level` (N,).
-        memory: correlation of the noise from one reading to the next.
+        memory: correlation of the noise from one reading to the next, or of its slow part.
+        slow: share of the noise's variance that is slow where the rest is white; 0 where all of it is alike.
         common: share of the noise's variance that all sensors have in common, as where a camera shakes.
         sway: correlation of that part from one reading to the next.
         turn: how far that part differs between the ends of the chain, over its size in the middle: the camera turns.
@@ -59,6 +60,7 @@ class Instrument:
     level: float
     each: Float[ndarray, " sites"]
     memory: float = 0.0
+    slow: float = 0.0
     common: float = 0.0
     sway: float = 0.0
     turn: float = 0.0
@@ -91,6 +93,8 @@ class Instrument:
         if self.kind == "heavy-tailed":
             return np.asarray(clean + scale * draw.standard_t(FREEDOM, size=clean.shape))
         noise = _correlated(draw.normal(size=clean.shape), self.memory)
+        if self.slow:
+            noise = np.sqrt(self.slow) * noise + np.sqrt(1 - self.slow) * draw.normal(size=clean.shape)
         if self.common:
             shake = _correlated(draw.normal(size=(len(clean), 1)), self.sway)
             noise = np.sqrt(1 - self.common) * noise + np.sqrt(self.common) * shake * self.lever
@@ -120,7 +124,7 @@ class Instrument:
         The information of Student's t is (nu + 1) / (nu + 3) over the scale squared; a reading that is a spike tells
         nothing. What the noise's own size tells about the reading is left out, and so is a zero that drifts.
         """
-        if self.common:
+        if self.common or self.slow:
             return self._filtered(columns / self.scale(clean, rms)[:, :, None])
         scale = self.scale(clean, rms)[:, :, None]
         if self.kind == "coarse":
@@ -135,21 +139,25 @@ class Instrument:
         return np.asarray(weighed.reshape(-1, columns.shape[2]))
 
     def _filtered(self, columns: Float[ndarray, "time sites columns"]) -> ndarray:
-        """Return columns in independent units of noise that has a part in common, by a Kalman filter of that part.
+        """Return columns in independent units of noise that is white but for a slow part, by a Kalman filter of that.
 
-        The sensors' readings less what is foreseen of the common part have the covariance V I + P w w^T, where V is the
-        variance of their own noise and P that of the common part, as it is foreseen.
+        The slow part is one number for all sensors where it is common, else one for each. The readings less what is
+        foreseen of it have the covariance V I + W P W^T, where V is the variance of the white noise, P the covariance
+        of the slow part as it is foreseen, and W says how much of it each sensor has.
         """
-        own, w = 1 - self.common, np.sqrt(self.common) * self.lever
-        foreseen, variance = np.zeros((1, columns.shape[2])), 1.0
+        sites, share = len(self.each), self.common or self.slow
+        w = np.sqrt(share) * (self.lever[:, None] if self.common else np.eye(sites))
+        sway = self.sway if self.common else self.memory
+        rest = np.eye(w.shape[1])
+        foreseen, covariance = np.zeros((w.shape[1], columns.shape[2])), rest
         found = np.empty_like(columns)
         for row, part in enumerate(columns):
-            new = part - w[:, None] * foreseen
-            root = np.linalg.cholesky(own * np.eye(len(w)) + variance * np.outer(w, w))
+            new = part - w @ foreseen
+            root = np.linalg.cholesky((1 - share) * np.eye(sites) + w @ covariance @ w.T)
             found[row] = np.linalg.solve(root, new)
-            pull = variance * np.linalg.solve(root.T, np.linalg.solve(root, w))
-            foreseen = self.sway * (foreseen + pull @ new)
-            variance = self.sway**2 * (variance - variance * float(pull @ w)) + 1 - self.sway**2
+            pull = np.linalg.solve(root.T, np.linalg.solve(root, w @ covariance)).T
+            foreseen = sway * (foreseen + pull @ new)
+            covariance = sway**2 * (covariance - pull @ w @ covariance) + (1 - sway**2) * rest
         return np.asarray(found.reshape(-1, columns.shape[2]))
 
     def times(self, span: float, readings: int, draw: np.random.Generator) -> tuple[ndarray, ndarray]:
@@ -228,6 +236,8 @@ def draw_instrument(draw: np.random.Generator, sites: int, kind: Kind) -> Instru
                 plain, common=float(draw.uniform(0.3, 0.95)), turn=float(draw.choice([0.0, 1.0]) * draw.uniform(-1, 1)),
                 sway=float(draw.choice([0.0, 1.0, 1.0]) * draw.uniform(0.3, 0.95)),
             )  # fmt: skip
+        case "slow":
+            return replace(plain, slow=float(draw.uniform(0.3, 0.8)), memory=float(draw.uniform(0.8, 0.98)))
         case "jittered-gaps":
             return replace(
                 _with_gaps(plain, draw, 1), uneven=float(draw.uniform(0.1, 0.45)), digits=bool(draw.uniform() < 0.5)
