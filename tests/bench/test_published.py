@@ -287,3 +287,21 @@ def test_of_the_faults_that_were_played_none_lost_anything_and_the_protocol_coun
     assert "at fifty random moments" in words("cluster")
     mutants = pd.read_csv(RESULTS / "mutants" / "mutants.csv", comment="#")
     assert f"no test notices, of {len(mutants)} drawn" in words("protocol")
+
+
+def test_the_protocol_says_what_the_tables_of_deepxde_say() -> None:
+    steps = pd.read_csv(RESULTS / "peers" / "step_time.csv", comment="#")["milliseconds per step"]
+    text = words("protocol")
+    for ratio, where in zip(steps[1:] / steps[0], ("as long as `pinn`", "with all", "with its forward"), strict=True):
+        assert f"{ratio:.0f} times {where}" in text
+    fits = pd.read_csv(RESULTS / "peers" / "fit.csv", comment="#")
+    for program, name in (("pinn-gn", "`pinn-gn`"), ("pielm", "`pielm`"), ("pinn", "`pinn`")):
+        times = fits.loc[fits["program"] == f"latticebench {program}", "seconds to E2 <= 0.01"]
+        middle, least, most = (f"{one:.2g}" for one in (times.median(), times.min(), times.max()))
+        assert f"{name} after {middle} s" in text
+        assert f"({least} to {most})" in text
+    other = fits[fits["program"].str.startswith("DeepXDE")]
+    times = other["seconds to E2 <= 0.01"]
+    assert times.max() == float("inf")
+    assert f"DeepXDE after {float(f'{times.median():.2g}'):g} s ({float(f'{times.min():.2g}'):g} s to never" in text
+    assert f"as it ends at {100 * other['E2'].max():.3g} %)" in text
