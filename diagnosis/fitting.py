@@ -201,8 +201,8 @@ class Fitted:
         layout: the pieces.
         followed: the model along them.
         noise: of every sensor.
-        cost: minus the logarithm of the likelihood, in nats, times the share of the readings that the curves of the
-            sites without an equation leave free: where they follow the noise there is none to compare models by.
+        cost: minus the log likelihood times the share of readings that the curves of sites without an equation leave
+            free (where these follow the noise, none is left to compare models by), and the noise's `price`; in nats.
         covariance: of the model's numbers, with what the model misfits.
         dispersion: by how much likelihood ratios are too large, as what is left is no noise; see `Normal.dispersion`.
         converged: whether the steps came to an end.
@@ -464,7 +464,7 @@ def _likely(
 ) -> tuple[Noise, float]:
     """Return the noise that makes what is left most likely, and the cost; see `Fitted.cost` for the share."""
     noise = estimate(followed.left, followed.swing, rows, free=free, structure=structure, start=start)
-    return noise, -share * noise.log_likelihood(followed.left, followed.swing, rows)
+    return noise, noise.price - share * noise.log_likelihood(followed.left, followed.swing, rows)
 
 
 def _stepped(

@@ -45,7 +45,9 @@ FAST = 0.2
 BANDS, FEWEST_LINES = 16, 8
 # A size within so many times the smallest that is looked for may be any smaller one.
 AT_LEAST = 1.1
-# Less than this share of the variance in common is not said.
+# A slow part is said to be all of the noise from this share of its variance on.
+MOST_SLOW = 0.995
+# Less than this share of the variance that is slow, or in common, is not said.
 LEAST_COMMON = 0.01
 WITH_OTHERS = "in common with the other sensors"
 ROBUST = 1.4826  # standard deviation over median absolute value, of a Gaussian
@@ -297,12 +299,12 @@ def describe(
         parts = [f"{most}{two_digits(size)} {unit}".rstrip()]
         if step > COARSE * size:
             parts.append(f"steps of {two_digits(step)}")
-        if memory > 0:
-            slow = 1 - noise.white[number] if len(noise.white) else 1.0
+        slow = 1 - noise.white[number] if len(noise.white) else 1.0
+        if memory > 0 and slow > LEAST_COMMON:
             near = (
                 f" ({two_digits(slow * np.exp(-interval / memory))} from one reading to the next)" if interval else ""
             )
-            share = f"{two_digits(100 * slow)} % of its variance " if slow < 1 else ""
+            share = f"{two_digits(100 * slow)} % of its variance " if slow < MOST_SLOW else ""
             parts.append(f"{share}correlated over {two_digits(memory)} {time}".rstrip() + near)
         if span is not None and walk > 0:
             parts.append(f"a zero that wanders by {two_digits(walk * np.sqrt(span))} {unit}".rstrip())

@@ -64,7 +64,7 @@ class Structure:
     white: bool = False
 
     def parameters(self, sensors: int) -> int:
-        """Return how many numbers describe the noise of so many sensors."""
+        """Return how many numbers describe the noise of so many sensors, but for its white part, which has a price."""
         groups = sensors if self.own_sizes else 1
         return (
             groups * (1 + self.memory + self.white)
@@ -93,6 +93,7 @@ class Noise:
             empty where no zero wanders.
         common: what the sensors have in common; None for nothing.
         white: share v of the variance that is white where the rest has a memory (sensors,); empty for none.
+        price: nats that this part has to win. Whether it is there is chosen for each fit, and not for all that compare.
     """
 
     size: Float[ndarray, " sensors"]
@@ -103,6 +104,7 @@ class Noise:
     walk: Float[ndarray, " sensors"] = field(default_factory=lambda: np.zeros(0))
     common: Common | None = None
     white: Float[ndarray, " sensors"] = field(default_factory=lambda: np.zeros(0))
+    price: float = 0.0
 
     @property
     def parameters(self) -> int:
@@ -148,12 +150,14 @@ class Noise:
         where, averages = np.flatnonzero(white > 0), None
         variance, beside = 1 - rho**2 + 2 * white * rho**2, -white * rho
         if np.any(self.walk):
-            some = np.flatnonzero(self.walk[chain.sensor] > 0)
-            linked = np.isfinite(chain.gap[some])
-            gap = np.where(linked, chain.gap[some], chain.time[some] - np.min(rows.times))
-            variance[some], beside[some] = covariance(size[some], self.walk[chain.sensor[some]], gap, linked)
-            own[some], before[some], log_size[some] = 1.0, linked, 0.0
-            where = np.union1d(where, some)
+            walking = np.flatnonzero(self.walk[chain.sensor] > 0)
+            linked = np.isfinite(chain.gap[walking])
+            gap = np.where(linked, chain.gap[walking], chain.time[walking] - np.min(rows.times))
+            variance[walking], beside[walking] = covariance(
+                size[walking], self.walk[chain.sensor[walking]], gap, linked
+            )
+            own[walking], before[walking], log_size[walking] = 1.0, linked, 0.0
+            where = np.union1d(where, walking)
         log_scale = float(np.sum(log_size))
         if len(where):
             averages = Averages.of(variance[where], beside[where])

@@ -37,8 +37,8 @@ LIGHTEST = 1000.0
 MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
 # The largest share that is white where the rest of the noise is slow: with all of it there would be no rest.
 MOST_WHITE = 0.999
-# Slow noise is seen in the means of so many readings.
-BLOCKS = (4, 16, 64)
+# Slow noise beside a white one is looked for in correlations over so many readings, of innovations up to so many sizes.
+LAGS, OUTLYING = 16, 3.0
 # Nats that each part of the structure but `white` and `common` must win beyond Schwarz' penalty. Five parts are tried,
 # on records of less than a hundred readings as well, and equal white sensors are to keep the simplest form in 98 of 100
 # records.
@@ -84,6 +84,8 @@ def estimate(
         found = task.lent(_Task.of(plain, level, rows).best(structure, start)[0], left, level, rows)
     if rows.walking:
         found = walked(found, left, level, rows, start)
+    if found.structure.white and not np.any(found.white):
+        found = replace(found, structure=replace(found.structure, white=False), white=np.zeros(0), price=0.0)
     everything, taken = len(task.value), float(np.sum(free))
     scale = float(np.sqrt(everything / max(everything - taken, 1.0))) if everything else 1.0
     own = np.full(task.sensors, scale)
@@ -121,7 +123,7 @@ def _chosen(task: _Task, common: bool) -> Noise:
         if structure not in tried:
             noise, likelihood = task.best(structure, near)
             margins = MARGIN * (sum(vars(structure).values()) - structure.white - structure.common)
-            margins += rules.BESIDE_WHITE * structure.white + rules.IN_COMMON * structure.common
+            margins += noise.price + rules.IN_COMMON * structure.common
             tried[structure] = each * noise.parameters + margins - likelihood, noise
         return tried[structure][0]
 
@@ -205,42 +207,41 @@ class _Task:
     def best(self, structure: Structure, start: Noise | None) -> tuple[Noise, float]:
         """Return the noise of greatest likelihood with a given structure, and its log likelihood.
 
-        A part is white besides a slow one only where that is worth its numbers: both together do the work of weak
-        forces.
+        A part is white besides a slow one only where that is worth its price: both together do the work of weak forces.
         """
         plain, likelihood = self.likeliest(replace(structure, white=False), start)
-        if not structure.white or self.is_exact():
+        if not structure.white or not plain.structure.memory or plain.structure.common or self.is_exact():
             return plain, likelihood
-        price = self.each * (structure.parameters(self.sensors) - plain.parameters) + rules.BESIDE_WHITE
-        if plain.structure.common or self.unsettled(plain) < price / 2:
+        groups = len(np.unique(self.sensor)) if structure.own_sizes else 1
+        price = self.each * groups + rules.BESIDE_WHITE
+        known = start is not None and len(start.white) > 0
+        if not known and self.unsettled(plain) < price / 2:
             return plain, likelihood
-        both, higher = self.likeliest(structure, start if start is not None and len(start.white) else plain)
-        return (both, higher) if higher > likelihood + price else (plain, likelihood)
+        both, higher = self.likeliest(structure, start if known else plain)
+        return (replace(both, price=price), higher) if higher > likelihood + price else (plain, likelihood)
 
     def unsettled(self, noise: Noise) -> float:
-        """Return about how many nats slow noise may be worth besides: what means of innovations vary too much for.
+        """Return about how many nats the correlations of innovations over some readings are worth.
 
-        Means of m independent numbers of size 1 have the variance 1 / m; if that of k of them is q times as much, the
-        likelihoods of both differ by k (q - 1 - ln q) / 2.
+        Of n pairs of independent numbers the squared correlation times n / 2 is 1/2 nat on the mean.
         """
         group, groups = self.groups(noise.structure)
         size = (noise.size if noise.structure.own_sizes else noise.size[:1]) / self.unit
         time = (noise.memory if noise.structure.own_sizes else noise.memory[:1]) / self.interval
         near = np.where(time > 0, np.exp(-1 / np.where(time > 0, time, 1.0)), 0.0)
-        *_, z = self.apart(size[group], noise.growth, near[group], white=False)
+        *_, z = self.innovations(size[group], noise.growth, near[group], white=False)
+        z = np.clip(z, -OUTLYING, OUTLYING)
         begin = np.flatnonzero(~self.linked)
         place = np.arange(len(z)) - np.repeat(begin, np.diff(begin, append=len(z)))
-        most = np.zeros(groups)
-        for many in BLOCKS:
-            first = np.flatnonzero(place % many == 0)
-            whole = np.diff(first, append=len(z)) == many
-            mean, of = np.add.reduceat(z, first)[whole] / many, group[first[whole]]
-            count = np.bincount(of, minlength=groups)
-            each = np.bincount(group, z**2, minlength=groups) / np.maximum(np.bincount(group, minlength=groups), 1)
-            ratio = many * np.bincount(of, mean**2, minlength=groups) / np.maximum(count * each, 1e-300)
-            nats = np.where(ratio > 1, count * (ratio - 1 - np.log(np.maximum(ratio, 1.0))) / 2, 0.0)
-            most = np.maximum(most, nats)
-        return float(np.sum(most))
+        variance = np.bincount(group, z**2, minlength=groups) / np.maximum(np.bincount(group, minlength=groups), 1)
+        nats = 0.0
+        for lag in range(1, min(LAGS, int(np.max(place))) + 1):
+            pairs = np.flatnonzero(place >= lag)
+            count = np.bincount(group[pairs], minlength=groups)
+            total = np.bincount(group[pairs], z[pairs] * z[pairs - lag], minlength=groups)
+            there = count > 0
+            nats += float(np.sum((total[there] / variance[there]) ** 2 / count[there] - 1)) / 2
+        return nats
 
     def likeliest(self, structure: Structure, start: Noise | None) -> tuple[Noise, float]:
         """Return the noise of greatest likelihood with all parts of a structure, and its log likelihood."""
@@ -283,8 +284,10 @@ class _Task:
             noise = replace(noise, common=replace(noise.common, share=share))
         if not noise.structure.own_sizes:
             return noise
-        memory = np.where(borrows, np.mean(noise.memory[~borrows]), noise.memory)
-        white = np.where(borrows, np.mean(noise.white[~borrows]), noise.white) if len(noise.white) else noise.white
+        alike = np.isin(np.arange(self.sensors), self.sensor)
+        alike[list(rows.curved | rows.walking)] = False
+        memory = np.where(borrows, np.mean(noise.memory[alike]), noise.memory)
+        white = np.where(borrows, np.mean(noise.white[alike]), noise.white) if len(noise.white) else noise.white
         first = self.plain(noise.structure).size / (np.sqrt(2) if np.isfinite(noise.tail) else 1.0)
         found = replace(noise, size=np.where(borrows, first, noise.size), memory=memory, white=white)
         for _ in range(LENT):
@@ -369,7 +372,7 @@ class _Task:
     def unpacked(self, numbers: Float[ndarray, " numbers"], structure: Structure) -> Noise:
         """Return the noise that numbers of `packed` stand for."""
         size, growth, tail, rho, white, near, shares = self.parts(numbers, structure)
-        everyone, time = np.ones(self.sensors), self.time(rho)
+        everyone, time = np.ones(self.sensors), self.time(np.where((1 - white) * rho > LEAST_CORRELATED, rho, 0.0))
         found = Noise(size * self.unit * everyone, growth, tail, time * everyone, structure)
         if structure.white:
             found = replace(found, white=np.where(time > 0, white, 0.0) * everyone)
@@ -401,14 +404,16 @@ class _Task:
         size = new / np.sqrt(1 - (1 - white) * rho**2)
         return size, growth, tail, rho, white, near, shares
 
-    def apart(self, size: Each, growth: float, near: Each, *, white: bool) -> tuple[Each, Each, Each, Each, Each, Each]:
+    def innovations(
+        self, size: Each, growth: float, near: Each, *, white: bool
+    ) -> tuple[Each, Each, Each, Each, Each, Each]:
         """Return sizes, residuals over these, those before, correlations, factors, and innovations.
 
         Args:
             size: at zero signal, of each reading.
             growth: with the signal.
             near: correlation over the typical interval, of each reading.
-            white: whether part of the noise is white, so that these are moving averages.
+            white: whether part of the noise is white; the innovations are then those of its moving averages.
         """
         s = np.sqrt(size**2 + (growth * self.level) ** 2) if growth else size
         y, rho = self.value / s, np.zeros_like(self.value)
@@ -423,7 +428,7 @@ class _Task:
         """Return minus the mean log likelihood of a reading, and its gradient."""
         size, growth, tail, near, white, common, shares = self.parts(numbers, structure)
         group, groups = self.groups(structure)
-        s, y, before, rho, q, z = self.apart(size[group], growth, near[group], white=structure.white)
+        s, y, before, rho, q, z = self.innovations(size[group], growth, near[group], white=structure.white)
         e = z
         mixed = self.beside.unmixings(shares, common, rho) if structure.common else []
         averages = None

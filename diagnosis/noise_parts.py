@@ -19,7 +19,10 @@ FEW_SENSORS = 8
 
 
 def shown(problem: Problem, fitted: Fitted) -> tuple[Structure, float]:
-    """Return the parts that the readings show, which all models of a horizon share, and the mean correlation time."""
+    """Return the parts that the readings show, which all models of a horizon share, and the mean correlation time.
+
+    A white part beside a slow one is chosen for each model anew: short pieces do not show it.
+    """
     followed = fitted.followed
     noise = estimate(followed.left, followed.swing, fitted.rows)
     found, few = noise.structure, len(fitted.rms) <= FEW_SENSORS
@@ -31,9 +34,10 @@ def shown(problem: Problem, fitted: Fitted) -> tuple[Structure, float]:
 
 def hides(noise: Noise, step: float) -> bool:
     """Whether noise does the work of forces: it is correlated over more than a step, or common to all sensors."""
-    return bool(np.max(noise.memory) >= step) or noise.common is not None
+    slow = noise.memory * (1 - noise.white) if len(noise.white) else noise.memory
+    return bool(np.max(slow) >= step) or noise.common is not None
 
 
 def white(noise: Noise) -> Noise:
     """Return the noise without what may hide an effect."""
-    return replace(noise, memory=0 * noise.memory, white=np.zeros(0), common=None)
+    return replace(noise, memory=0 * noise.memory, white=np.zeros(0), price=0.0, common=None)

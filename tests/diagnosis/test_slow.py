@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 
 from latticebench.bench.trials.laboratory.instruments import Instrument
 from latticebench.bench.trials.laboratory.making import make_recording
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.averages import Averages
 from latticebench.diagnosis.instrument import describe
 from latticebench.diagnosis.noise import Noise, Structure
@@ -102,6 +103,16 @@ def test_the_likelihood_is_that_of_a_normal_distribution_with_the_covariance_of_
     assert noise.log_likelihood(left, level, rows) == pytest.approx(expected, rel=1e-10)
 
 
+def test_beside_a_zero_that_wanders_each_sensor_has_the_likelihood_that_it_has_alone():
+    draw = np.random.default_rng(15)
+    rows, noise = rows_of(50, (0, 1), pieces=(15,)), noise_of((0.4, 0.0), (0.5, 0.0), size=(1.0, 2.0))
+    noise = replace(noise, walk=np.array([0.0, 0.5]))
+    left, level = draw.normal(size=(2, 50, 2))
+    each = [np.where(np.arange(2) == one, left, np.nan) for one in range(2)]
+    alone = sum(noise.log_likelihood(one, level, rows) for one in each)
+    assert noise.log_likelihood(left, level, rows) == pytest.approx(alone, rel=1e-12)
+
+
 def test_the_transposed_whitener_is_the_transposed_matrix_beside_a_zero_that_wanders():
     draw = np.random.default_rng(4)
     rows = rows_of(50, (0, 1, 2), pieces=(15,))
@@ -162,6 +173,46 @@ def test_noise_that_is_all_white_or_all_correlated_keeps_no_other_part(near):
     assert kept <= 2
 
 
+@pytest.mark.parametrize(
+    ("count", "share", "near", "piece"),
+    [(300, 0.3, 0.9, 300), (1000, 0.3, 0.8, 1000), (300, 0.3, 0.98, 300), (2000, 0.4, 0.9, 10)],
+)
+def test_a_slow_part_that_is_worth_its_price_is_found_in_short_records_and_in_short_pieces(count, share, near, piece):
+    kept = 0
+    for seed in range(20):
+        left = drawn(seed, count, (share,), near)
+        rows = rows_of(count, (0,), pieces=range(piece, count, piece))
+        task = _Task.of(left, np.zeros_like(left), rows)
+        plain, likelihood = task.likeliest(replace(BOTH, white=False), None)
+        higher = task.likeliest(BOTH, plain)[1]
+        found = task.best(BOTH, None)[0]
+        worth = higher - likelihood > task.each + rules.BESIDE_WHITE
+        assert not found.structure.white or worth
+        kept += found.structure.white == worth
+    assert kept >= 18
+
+
+def test_the_price_of_a_white_part_counts_the_sensors_that_may_have_one():
+    """What else is asked for and cannot be there costs nothing, nor do zeros that wander."""
+    left = np.hstack([drawn(12, 400, (0.4,), 0.9), np.cumsum(np.random.default_rng(13).normal(size=(400, 3)), axis=0)])
+    alone = estimate(left[:, :1], np.zeros((400, 1)), rows_of(400, (0,)), structure=BOTH)
+    assert alone.price == pytest.approx(np.log(400) / 2 + rules.BESIDE_WHITE)
+    asked = replace(BOTH, growth=True, common=True)
+    other = estimate(left[:, :1], np.zeros((400, 1)), rows_of(400, (0,)), structure=asked)
+    np.testing.assert_allclose((other.price, other.white[0]), (alone.price, alone.white[0]))
+    rows = replace(rows_of(400, range(4)), walking=frozenset([1, 2, 3]))
+    beside = estimate(left, np.zeros_like(left), rows, structure=BOTH)
+    np.testing.assert_allclose((beside.price, beside.white[0]), (alone.price, alone.white[0]))
+
+
+def test_where_all_zeros_wander_no_part_is_white_besides():
+    left = np.cumsum(np.random.default_rng(14).normal(size=(400, 2)), axis=0)
+    rows = replace(rows_of(400, (0, 1)), walking=frozenset([0, 1]))
+    for structure in (None, BOTH):
+        found = estimate(left, np.zeros_like(left), rows, structure=structure)
+        assert (found.structure.white, len(found.white), found.price) == (False, 0, 0.0)
+
+
 def test_what_is_new_from_one_reading_to_the_next_is_no_less_than_what_a_converter_lets_through():
     """A constant that is left looks slow; beside it, the size of the noise must not fall below its floor."""
     rows = rows_of(2000, (0,), least=1.0)
@@ -198,6 +249,8 @@ def test_the_report_says_how_much_of_the_noise_is_correlated():
     assert describe(noise, (0.0, 0.0), "deg", interval=0.05, time="s") == [
         "all sensors: 0.3 deg, 75 % of its variance correlated over 0.5 s (0.68 from one reading to the next)"
     ]
+    assert describe(noise_of((0.001,), (0.5,)), [0.0], time="s") == ["sensor 1: 1, correlated over 0.5 s"]
+    assert describe(noise_of((0.999,), (0.5,)), [0.0], time="s") == ["sensor 1: 1"]
 
 
 # Recordings -----------------------------------------------------------------------------------------------------------
