@@ -66,12 +66,7 @@ class Structure:
     def parameters(self, sensors: int) -> int:
         """Return how many numbers describe the noise of so many sensors, but for its white part, which has a price."""
         groups = sensors if self.own_sizes else 1
-        return (
-            groups * (1 + self.memory + self.white)
-            + self.growth
-            + self.tails
-            + self.common * (self.shares(sensors) + 1)
-        )
+        return groups * (1 + self.memory) + self.growth + self.tails + self.common * (self.shares(sensors) + 1)
 
     def shares(self, sensors: int) -> int:
         """Return how many numbers say what so many sensors have in common."""

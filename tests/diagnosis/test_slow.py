@@ -197,6 +197,7 @@ def test_the_price_of_a_white_part_counts_the_sensors_that_may_have_one():
     left = np.hstack([drawn(12, 400, (0.4,), 0.9), np.cumsum(np.random.default_rng(13).normal(size=(400, 3)), axis=0)])
     alone = estimate(left[:, :1], np.zeros((400, 1)), rows_of(400, (0,)), structure=BOTH)
     assert alone.price == pytest.approx(np.log(400) / 2 + rules.BESIDE_WHITE)
+    assert alone.parameters == replace(alone, structure=replace(BOTH, white=False)).parameters
     asked = replace(BOTH, growth=True, common=True)
     other = estimate(left[:, :1], np.zeros((400, 1)), rows_of(400, (0,)), structure=asked)
     np.testing.assert_allclose((other.price, other.white[0]), (alone.price, alone.white[0]))
