@@ -239,7 +239,7 @@ class _Task:
             pairs = np.flatnonzero(place >= lag)
             count = np.bincount(group[pairs], minlength=groups)
             total = np.bincount(group[pairs], z[pairs] * z[pairs - lag], minlength=groups)
-            there = count > 0
+            there = (count > 0) & (variance > 0)
             nats += float(np.sum((total[there] / variance[there]) ** 2 / count[there] - 1)) / 2
         return nats
 
