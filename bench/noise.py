@@ -1,9 +1,9 @@
 """The noise of recordings as a fit of their motion leaves it, sensor by sensor, and whether the equation misfits.
 
 The noise is estimated with the model of `latticebench.diagnosis.noise`. An equation that lacks something leaves more,
-and that counts as noise, too. Differences of neighbouring readings show the noise without any equation
-(`latticebench.diagnosis.instrument`): where a fit leaves much more, the equation misfits, unless the rest is noise that
-is correlated from one reading to the next.
+and that counts as noise, too; noise of two kinds is left out, for it could do the work of nearly any force. Differences
+of neighbouring readings show the noise without any equation (`latticebench.diagnosis.instrument`): where a fit leaves
+much more, the equation misfits, unless the rest is noise that is correlated from one reading to the next.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def left_by(data: Sequence[Samples], fit: Fit) -> Left:
         halves = np.split(own, 2, axis=1)
         units[data[0].sites :] = np.sqrt(np.nanmean(halves[1] ** 2) / max(np.nanmean(halves[0] ** 2), TINY)) or 1.0
     scale = units[rows.sensor]
-    noise = estimate(own / scale, level / scale, rows, free=free, common=False)
+    noise = estimate(own / scale, level / scale, rows, free=free, mixed=False)
     noise = replace(noise, size=noise.size * units)
     ratios, silent = _ratios(data, left, noise, rows, order)
     times = float(np.sqrt(np.mean(ratios**2))) if len(ratios) else np.nan

@@ -54,7 +54,7 @@ LENT = 8
 
 def estimate(
     left: Readings, level: Readings, rows: Rows, *, free: Float[ndarray, " sensors"] | float = 0.0,
-    structure: Structure | None = None, start: Noise | None = None, common: bool = True,
+    structure: Structure | None = None, start: Noise | None = None, mixed: bool = True,
 ) -> Noise:  # fmt: skip
     """Return the noise under which residuals are most likely.
 
@@ -66,7 +66,7 @@ def estimate(
             fit leaves residuals that are too small: sizes are multiplied by sqrt(n / (n - free)).
         structure: which parts to use; chosen by Schwarz' criterion if left out.
         start: where to start, such as the noise at the last step of an iteration.
-        common: whether sensors may have something in common where the structure is chosen.
+        mixed: whether noise may be of two kinds where the structure is chosen: in common and not, or white and slow.
     """
     task = _Task.of(left, level, rows)
     apart = np.isin(rows.sensor, list(rows.curved | rows.walking))
@@ -76,7 +76,7 @@ def estimate(
         # Where all zeros wander, growth, tails and what is common are not told from the walks.
         structure = replace(structure, growth=False, tails=False, white=False, common=False)
     if structure is None:
-        start = _chosen(_Task.of(*_glance(plain, level, rows)), common)
+        start = _chosen(_Task.of(*_glance(plain, level, rows)), mixed)
         structure = start.structure
     if plain is left:
         found = task.best(structure, start)[0]
@@ -107,7 +107,7 @@ def _glance(left: ndarray, level: ndarray, rows: Rows) -> tuple[ndarray, ndarray
     return left[few], level[few], replace(rows, times=rows.times[few], first=first)
 
 
-def _chosen(task: _Task, common: bool) -> Noise:
+def _chosen(task: _Task, mixed: bool) -> Noise:
     """Return the noise of the structure that Schwarz' criterion prefers, found step by step.
 
     One part is added or taken away at a time, whichever helps most, until nothing helps: what one part did alone may
@@ -116,8 +116,9 @@ def _chosen(task: _Task, common: bool) -> Noise:
     tried: dict[Structure, tuple[float, Noise]] = {}
     each = task.each
     # The common part takes long to fit: it is left alone where it is far from worth its two numbers.
-    alone = not common or "common" not in task.possible or task.beside.promises(task.value) < each + rules.IN_COMMON / 2
-    parts = [part for part in task.possible if part != "common" or not alone]
+    alone = "common" not in task.possible or task.beside.promises(task.value) < each + rules.IN_COMMON / 2
+    without = {"common", "white"} if not mixed else {"common"} if alone else set()
+    parts = [part for part in task.possible if part not in without]
 
     def price(structure: Structure, near: Noise | None) -> float:
         if structure not in tried:
