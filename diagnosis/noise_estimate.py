@@ -116,9 +116,9 @@ def _chosen(task: _Task, mixed: bool) -> Noise:
     tried: dict[Structure, tuple[float, Noise]] = {}
     each = task.each
     # The common part takes long to fit: it is left alone where it is far from worth its two numbers.
-    alone = "common" not in task.possible or task.beside.promises(task.value) < each + rules.IN_COMMON / 2
-    without = {"common", "white"} if not mixed else {"common"} if alone else set()
-    parts = [part for part in task.possible if part not in without]
+    possible = [part for part in task.possible if mixed or part not in ("common", "white")]
+    alone = "common" in possible and task.beside.promises(task.value) < each + rules.IN_COMMON / 2
+    parts = [part for part in possible if part != "common" or not alone]
 
     def price(structure: Structure, near: Noise | None) -> float:
         if structure not in tried:
