@@ -15,7 +15,8 @@ from latticebench.bench.trials.laboratory.making import make_recording
 from latticebench.diagnosis.common import Common
 from latticebench.diagnosis.instrument import describe
 from latticebench.diagnosis.noise import Noise, Structure
-from latticebench.diagnosis.noise_estimate import _Task, estimate
+from latticebench.diagnosis.noise_estimate import estimate
+from latticebench.diagnosis.noise_likelihood import Residuals
 from latticebench.diagnosis.repair import diagnose
 from latticebench.diagnosis.rows import Rows
 from latticebench.systems.effects import CATALOGUE
@@ -133,7 +134,7 @@ def test_the_gradient_of_the_likelihood_is_its_finite_difference(sensor, own):
     left[90] = np.nan
     level = np.cos(rows.times[:, None] + np.arange(len(sensor)))
     every = Structure(own, True, True, True, True)
-    task = _Task.of(left, level, rows)
+    task = Residuals.of(left, level, rows)
     start = task.packed(task.plain(every), every)
     numbers = start + 0.03 * draw.normal(size=len(start))
     cost, gradient = task.cost(numbers, every)
@@ -197,7 +198,7 @@ def test_the_likelihood_of_an_estimate_is_that_of_the_search_for_it_at_its_bound
         own = lfilter([0.6], [1.0, -0.8], draw.normal(size=(400, 3)), axis=0)
         left = np.sqrt(0.4) * own + np.sqrt(0.6) * draw.normal(size=(400, 1))
         rows = rows_of(400, range(3))
-        task = _Task.of(left, np.ones_like(left), rows)
+        task = Residuals.of(left, np.ones_like(left), rows)
         found, height = task.best(replace(SHARED, memory=True), None)
         assert found.log_likelihood(left, np.ones_like(left), rows) == pytest.approx(height, abs=0.5)
 

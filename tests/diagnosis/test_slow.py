@@ -16,7 +16,8 @@ from latticebench.diagnosis import rules
 from latticebench.diagnosis.averages import Averages
 from latticebench.diagnosis.instrument import describe
 from latticebench.diagnosis.noise import Noise, Structure
-from latticebench.diagnosis.noise_estimate import _Task, estimate
+from latticebench.diagnosis.noise_estimate import estimate
+from latticebench.diagnosis.noise_likelihood import Residuals
 from latticebench.diagnosis.noise_parts import white
 from latticebench.diagnosis.repair import diagnose
 from latticebench.diagnosis.rows import Rows
@@ -146,7 +147,7 @@ def test_the_gradient_of_the_likelihood_is_its_finite_difference(own):
     rows = rows_of(150, (0, 1, 2), pieces=(40,), uneven=draw)
     left, level = drawn(7, 150, (0.4,) * 3, 0.9, sizes=(1.0, 0.2, 3.0)), draw.normal(size=(150, 3))
     left[draw.random(left.shape) < 0.1] = np.nan
-    task = _Task.of(left, level, rows)
+    task = Residuals.of(left, level, rows)
     structure = Structure(own_sizes=own, growth=True, tails=True, memory=True, white=True)
     numbers = task.packed(task.plain(structure), structure)
     expected = approx_fprime(numbers, lambda of: task.cost(of, structure)[0], 1e-7)
@@ -182,7 +183,7 @@ def test_a_slow_part_that_is_worth_its_price_is_found_in_short_records_and_in_sh
     for seed in range(20):
         left = drawn(seed, count, (share,), near)
         rows = rows_of(count, (0,), pieces=range(piece, count, piece))
-        task = _Task.of(left, np.zeros_like(left), rows)
+        task = Residuals.of(left, np.zeros_like(left), rows)
         plain, likelihood = task.likeliest(replace(BOTH, white=False), None)
         higher = task.likeliest(BOTH, plain)[1]
         found = task.best(BOTH, None)[0]
