@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.bench.report.units import noise_in_words, units_of
+from latticebench.bench.report.noise import noise_in_words
+from latticebench.bench.report.units import units_of
 from latticebench.diagnosis.instrument import ROBUST, of_readings, step_of, two_digits
 from latticebench.diagnosis.noise import Noise
 from latticebench.diagnosis.noise_estimate import estimate

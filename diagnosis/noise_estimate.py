@@ -61,9 +61,9 @@ def estimate(
         start = _chosen(Residuals.of(*_glance(plain, level, rows)), mixed)
         structure = start.structure
     if plain is left:
-        found = _best(residuals, structure, start)[0]
+        found = preferred(residuals, structure, start)[0]
     else:
-        known = _best(Residuals.of(plain, level, rows), structure, start)[0]
+        known = preferred(Residuals.of(plain, level, rows), structure, start)[0]
         found = _lent(known, residuals, left, level, rows)
     if rows.walking:
         found = walked(found, left, level, rows, start)
@@ -105,7 +105,7 @@ def _chosen(residuals: Residuals, mixed: bool) -> Noise:
 
     def price(structure: Structure, near: Noise | None) -> float:
         if structure not in tried:
-            noise, nats = _best(residuals, structure, near)
+            noise, nats = preferred(residuals, structure, near)
             margins = MARGIN * (sum(vars(structure).values()) - structure.white - structure.common)
             margins += noise.price + rules.IN_COMMON * structure.common
             tried[structure] = each * noise.parameters + margins - nats, noise
@@ -123,7 +123,7 @@ def _chosen(residuals: Residuals, mixed: bool) -> Noise:
     return tried[here][1]
 
 
-def _best(residuals: Residuals, structure: Structure, start: Noise | None) -> tuple[Noise, float]:
+def preferred(residuals: Residuals, structure: Structure, start: Noise | None) -> tuple[Noise, float]:
     """Return the noise of greatest likelihood with a given structure, and its log likelihood.
 
     A part is white besides a slow one only where that is worth its price: both together do the work of weak forces.

@@ -17,10 +17,11 @@ from latticebench.bench.report.equation import Equation, equation
 from latticebench.bench.report.findings import AddedEffect, added, declared
 from latticebench.bench.report.horizons import HorizonReport, horizons
 from latticebench.bench.report.modes import Modes, modes
+from latticebench.bench.report.noise import SensorNoise, noise_in_numbers, noise_in_words
 from latticebench.bench.report.notes import notes
 from latticebench.bench.report.separation import Separation, separations
 from latticebench.bench.report.shown import Shown
-from latticebench.bench.report.units import Units, in_sentence, noise_in_words, of_coefficients, units_of
+from latticebench.bench.report.units import Units, in_sentence, of_coefficients, units_of
 from latticebench.bench.report.whereabouts import Whereabouts, whereabouts
 from latticebench.diagnosis.instrument import step_of, two_digits
 from latticebench.diagnosis.repair import NOT_FOLLOWED, NOT_REACHED, shortfalls
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from latticebench.bench.overlay import Overlay
     from latticebench.diagnosis.acting import Chain
     from latticebench.diagnosis.fitting import Fitted
+    from latticebench.diagnosis.noise import Noise
     from latticebench.diagnosis.repair import Diagnosis
 
 # A model that leaves less than so many times the noise comes down to it.
@@ -128,6 +130,7 @@ class Report(Content):
         noise: standard deviation of the noise of each sensor, in the units of its readings; of each part of a complex
             reading.
         noise_lines: the noise in words.
+        sensors: the parts of the noise of each sensor; empty in a document of a version that did not say them.
         effects: what was added.
         separations: what cannot be told apart, and what would separate it.
         modes: eigenfrequencies and decay rates beside the peaks of the recording's spectrum.
@@ -159,6 +162,7 @@ class Report(Content):
     interrupted: bool
     partly: tuple[str, ...] = ()
     declared_units: dict[str, str] = {}
+    sensors: dict[str, SensorNoise] = {}
 
 
 class DiagnosisDocument(Report, Document):
@@ -203,6 +207,7 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
         ),
         notes=notes(diagnosis), interrupted=interrupted, partly=shortfalls(diagnosis),
         declared_units=dict(zip(after, own, strict=bool(own))),
+        sensors=dict(zip(sensors, noise_in_numbers(_read(diagnosis), units, _span(diagnosis)), strict=True)),
     )  # fmt: skip
 
 
@@ -275,13 +280,22 @@ def _noise_lines(diagnosis: Diagnosis, units: Units) -> tuple[str, ...]:
     """Return the noise in words, in the unit of the readings where it is known."""
     if not units.reading and units.scale == 1:
         return diagnosis.noise_lines
-    first = diagnosis.data[0]
-    found, interval = diagnosis.after.noise, float(np.median(np.diff(first.t)))
-    noise = replace(found, size=np.where(np.isnan(diagnosis.noise), np.nan, found.size))
+    first, noise = diagnosis.data[0], _read(diagnosis)
+    interval = float(np.median(np.diff(first.t)))
     fields = [first.u] if len(noise.size) == first.sites or first.v is None else [first.u, first.v]
     steps = [step_of(split_parts(one[:, k], first.is_complex).ravel()) for one in fields for k in range(first.sites)]
-    span = max(float(one.t[-1] - one.t[0]) for one in diagnosis.data)
-    return tuple(noise_in_words(noise, steps, interval, first.sites, units, span))
+    return tuple(noise_in_words(noise, steps, interval, first.sites, units, _span(diagnosis)))
+
+
+def _read(diagnosis: Diagnosis) -> Noise:
+    """Return the noise of the last model; its size is NaN for sensors that were not read."""
+    found = diagnosis.after.noise
+    return replace(found, size=np.where(np.isnan(diagnosis.noise), np.nan, found.size))
+
+
+def _span(diagnosis: Diagnosis) -> float:
+    """Return the length of the longest recording."""
+    return max(float(one.t[-1] - one.t[0]) for one in diagnosis.data)
 
 
 def _equation(fitted: Fitted, chain: Chain, units: Units) -> Equation:

@@ -7,17 +7,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from latticebench.bench.escape import label
 from latticebench.bench.report.document import Content, Number
-from latticebench.diagnosis.instrument import describe
 from latticebench.systems.parser import TermError
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
-    from latticebench.diagnosis.noise import Noise
     from latticebench.systems.samples import Origin
 
 # Digits of a number within a sentence.
@@ -142,29 +139,3 @@ def in_sentence(line: str, units: Units) -> str:
         factor, unit = of_natural(zero[1], units)
         return f"{zero[1]}: {with_unit(f'{float(zero[2]) * factor:.{DIGITS}g}', unit)}{zero[3]}"
     return with_unit(line, units.time) if re.search(r" within [\d.e+-]+$", line) else line
-
-
-def noise_in_words(
-    noise: Noise, steps: Sequence[float], interval: float, sites: int, units: Units, span: float | None = None
-) -> list[str]:
-    """Return the noise of each sensor in words, in the unit of its readings; see `diagnosis.instrument.describe`.
-
-    Args:
-        noise: in units of the equation.
-        steps: of the sensors' converters, in the same.
-        interval: time from one reading to the next.
-        sites: sensors of u, after which those of v come.
-        units: of the recording.
-        span: length of the recording, over which zeros wander.
-    """
-    lines: list[str] = []
-    for begin in range(0, len(noise.size), sites):
-        own = slice(begin, begin + sites)
-        size, walk = noise.size[own] / abs(units.scale), noise.walk[own] / abs(units.scale)
-        common = None if noise.common is None else replace(noise.common, share=noise.common.share[own])
-        part = replace(noise, size=size, memory=noise.memory[own], white=noise.white[own], walk=walk, common=common)
-        unit = units.reading if begin == 0 else rate_of(units.reading, units.time)
-        grid = [step / abs(units.scale) for step in steps[own]]
-        told = describe(part, grid, unit, interval=interval, time=units.time, span=span)
-        lines += [("velocity, " if begin else "") + line for line in told]
-    return lines

@@ -15,7 +15,7 @@ from latticebench.bench.trials.laboratory.making import make_recording
 from latticebench.diagnosis.common import Common
 from latticebench.diagnosis.instrument import describe
 from latticebench.diagnosis.noise import Noise, Structure
-from latticebench.diagnosis.noise_estimate import estimate
+from latticebench.diagnosis.noise_estimate import estimate, preferred
 from latticebench.diagnosis.noise_likelihood import Residuals
 from latticebench.diagnosis.repair import diagnose
 from latticebench.diagnosis.rows import Rows
@@ -199,7 +199,7 @@ def test_the_likelihood_of_an_estimate_is_that_of_the_search_for_it_at_its_bound
         left = np.sqrt(0.4) * own + np.sqrt(0.6) * draw.normal(size=(400, 1))
         rows = rows_of(400, range(3))
         task = Residuals.of(left, np.ones_like(left), rows)
-        found, height = task.best(replace(SHARED, memory=True), None)
+        found, height = preferred(task, replace(SHARED, memory=True), None)
         assert found.log_likelihood(left, np.ones_like(left), rows) == pytest.approx(height, abs=0.5)
 
 

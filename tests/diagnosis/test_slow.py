@@ -16,7 +16,7 @@ from latticebench.diagnosis import rules
 from latticebench.diagnosis.averages import Averages
 from latticebench.diagnosis.instrument import describe
 from latticebench.diagnosis.noise import Noise, Structure
-from latticebench.diagnosis.noise_estimate import estimate
+from latticebench.diagnosis.noise_estimate import estimate, preferred
 from latticebench.diagnosis.noise_likelihood import Residuals
 from latticebench.diagnosis.noise_parts import white
 from latticebench.diagnosis.repair import diagnose
@@ -186,7 +186,7 @@ def test_a_slow_part_that_is_worth_its_price_is_found_in_short_records_and_in_sh
         task = Residuals.of(left, np.zeros_like(left), rows)
         plain, likelihood = task.likeliest(replace(BOTH, white=False), None)
         higher = task.likeliest(BOTH, plain)[1]
-        found = task.best(BOTH, None)[0]
+        found = preferred(task, BOTH, None)[0]
         worth = higher - likelihood > task.each + rules.BESIDE_WHITE
         assert not found.structure.white or worth
         kept += found.structure.white == worth

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
-from latticebench.bench.report.units import Units, in_sentence, noise_in_words, of_coefficient, of_natural
-from latticebench.diagnosis.noise import Noise, Structure
+from latticebench.bench.report.units import Units, in_sentence, of_coefficient, of_natural
 from latticebench.systems.terms import Term
 
 # A sensor that counts backwards, in millimetres.
@@ -35,12 +33,6 @@ def test_the_natural_form_of_a_walk_is_positive_in_that_unit() -> None:
     assert of_natural("walk of u2", MIRRORED) == (1000.0, "mm")
     assert of_natural("offset of u2", MIRRORED) == (-1000.0, "mm")
     assert of_natural("hum of u2, cos(6.86*(t-5))", MIRRORED) == (-1000.0, "mm")
-
-
-def test_the_noise_says_how_far_a_zero_wanders_over_the_recording_in_that_unit() -> None:
-    noise = Noise(np.array([0.001, 0.002]), 0.0, np.inf, np.zeros(2), Structure(own_sizes=True), np.array([0.0, 0.01]))
-    lines = noise_in_words(noise, [0.0, 0.0], 0.1, 2, MIRRORED, span=25.0)
-    assert lines == ["sensor 1: 1 mm", "sensor 2: 2 mm, a zero that wanders by 50 mm"]
 
 
 PENDULA = Units(time="s", reading="deg", equation="rad", scale=0.0174533)
