@@ -15,7 +15,7 @@ from scipy.special import betaincinv, gammaincinv
 
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Force, InStep, Placed
-from latticebench.diagnosis.fitting import by_pieces
+from latticebench.diagnosis.normal import by_pieces
 from latticebench.diagnosis.propagation import propagate
 from latticebench.diagnosis.score import Tangent, columns_of
 

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.acting import Placed
-from latticebench.diagnosis.fitting import Fitted, by_pieces, gain, left_free, normal, scaled_inverse, whitened
+from latticebench.diagnosis.fitting import Fitted, gain, left_free, whitened
 from latticebench.diagnosis.horizon import fields
 from latticebench.diagnosis.model import Assembled, Model, read_term
+from latticebench.diagnosis.normal import by_pieces, normal, scaled_inverse
 from latticebench.diagnosis.propagation import propagate
 
 if TYPE_CHECKING:
