@@ -37,7 +37,7 @@ def load(path: Path) -> pd.DataFrame:
         table[name] = table["data"].str.extract(rf"{name}=([\d.]+)")[0].astype(float).fillna(usual)
     table["own"] = table["library"].isin(OWN)
     table["ratio"] = table["e2"] / table["bound"]
-    table["right"] = (table["tpr"] == 1) & (table["spurious"] == 0)
+    table["right"] = ((table["tpr"] == 1) & (table["spurious"] == 0)).where(table["e2"].notna()).astype(float)
     return table
 
 
@@ -46,6 +46,7 @@ def by_method(noisy: pd.DataFrame) -> pd.DataFrame:
     groups = noisy.groupby(["own", "method"])
     compared = pd.DataFrame({
         "kinds of data": groups.size(),
+        "with a bound": groups["ratio"].count(),
         "E2 / bound, median": groups["ratio"].median(),
         "90th percentile": groups["ratio"].quantile(0.9),
         "largest": groups["ratio"].max(),
@@ -71,10 +72,15 @@ def markdown(table: pd.DataFrame) -> str:
 
 
 def lost_fits(trajectory: pd.DataFrame) -> str:
-    """List the lost fits of `trajectory`, one per line."""
-    lost = trajectory[trajectory["ratio"] > LOST]
+    """List the lost fits of `trajectory`, one per line, of those that have a bound."""
+    lost, bounded = trajectory[trajectory["ratio"] > LOST], trajectory["ratio"].count()
+    refused = int(trajectory["e2"].isna().sum())
     lines = [f"- {row.data} ({row.library}): {row.ratio:.2g} times the bound" for row in lost.itertuples()]
-    title = f"Lost fits of `trajectory` (E2 more than {LOST:g} times the bound): {len(lost)} of {len(trajectory)}."
+    title = (
+        f"Lost fits of `trajectory` (E2 more than {LOST:g} times the bound): {len(lost)} of the {bounded} that have a "
+        f"bound. {len(trajectory) - bounded} have none, as computing it takes more memory than a case may use; of "
+        f"these, {refused} were refused, as the fit would take more, too."
+    )
     return "\n".join([title, *(["", *lines] if lines else []), ""])
 
 

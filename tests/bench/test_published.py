@@ -210,6 +210,28 @@ def test_the_page_on_the_diagnosis_says_what_the_table_of_recordings_that_lack_n
     assert f"it names something in {exact.split(' (')[0]} of {exact.split()[-1]} " in readme
 
 
+def test_the_page_on_the_limit_says_what_the_table_of_all_crossed_says(script: Callable[[str], ModuleType]) -> None:
+    cross = script("cross/cross.py")
+    table = cross.load(RESULTS / "cross" / "summary.csv")
+    noisy = table[table["noise"] > 0]
+    own, large = noisy[noisy["own"]], noisy[~noisy["own"]]
+    ratio = {name: own.loc[own["method"] == name, "ratio"] for name in ("trajectory", "weak")}
+    noisiest = noisy[(noisy["method"] == "trajectory") & (noisy["noise"] == 0.1)]
+    lost = noisiest[noisiest["ratio"] > cross.LOST]
+    assert not lost["own"].any()
+    page = re.sub(r"\s+", " ", words("limit"))
+    for said in (
+        f"the median error of `trajectory` (one seed) is {ratio['trajectory'].median():.2g} times the bound and at "
+        f"most {ratio['trajectory'].max():.2g} times, that of `weak` (ten seeds) {ratio['weak'].median():.1f} and at most "
+        f"{ratio['weak'].max():.2g} times",
+        f"rightly in {100 * large.loc[large['method'] == 'weak', 'right'].mean():.0f} %",
+        f"loses {len(lost)} of the {noisiest['ratio'].count()} fits that have a bound",
+        f"{len(table.groupby(['data', 'library']))} kinds of data, "
+        f"{table['ok'].str.split('/').str[1].astype(int).sum()} fits",
+    ):
+        assert said in page
+
+
 def test_the_page_on_methods_says_what_the_table_of_limits_says(script: Callable[[str], ModuleType]) -> None:
     shows = script("limits/which.py")
     table = shows.load(shows.HERE)
