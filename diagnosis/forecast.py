@@ -187,7 +187,7 @@ def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Predi
         field = whole[:, : problem.chain.levels]
         predicted = field[:, 0].copy()
         for placed, _ in model.instruments():
-            predicted += placed.misread(late, field).added[:, 0]
+            predicted += placed.misread(late, whole).added[:, 0]
         # Nothing is likelier of a zero that wanders than that it stays where it is.
         predicted += again.zeros(number)[0]
         seen = split_parts(samples.u[cut : cut + MOST_ROWS], samples.is_complex)

@@ -82,8 +82,8 @@ class _Pull:
     def __init__(self, tangent: Tangent, number: int, readings: ndarray) -> None:
         self.tangent, self.number = tangent, number
         self.t, self.chain = tangent.along[number].t, tangent.fitted.chain
-        self.dual = _dual(tangent, number, readings * tangent.own(number)[..., None])
-        chain = self.chain
+        chain, (own, by_rate) = self.chain, tangent.slopes(number)
+        self.dual = _dual(tangent, number, readings * own[..., None], _by_rates(readings, by_rate))
         self.readings = readings.reshape(len(self.t), chain.levels, chain.parts, chain.sites, -1)[:, 0]
         self.courses: dict[InStep | None, ndarray] = {}
 
@@ -138,13 +138,23 @@ def _looked(tangent: Tangent) -> list[ndarray]:
     return np.split(readings, ends[:-1])
 
 
-def _dual(tangent: Tangent, number: int, readings: ndarray) -> ndarray:
-    """Return derivatives by forces from those by the readings' fields (rows, channels, 1 + D)."""
+def _by_rates(readings: ndarray, by_rate: ndarray | None) -> ndarray | None:
+    """Return derivatives by v from those by the readings (rows, channels, 1 + D): (rows, parts, N, 1 + D)."""
+    if by_rate is None:
+        return None
+    return np.asarray(readings[:, : by_rate[0].size].reshape(*by_rate.shape, -1) * by_rate[..., None])
+
+
+def _dual(tangent: Tangent, number: int, readings: ndarray, rates: ndarray | None) -> ndarray:
+    """Return derivatives by forces from those by the readings' fields (rows, channels, 1 + D) and by their rates."""
     layout, along, chain = tangent.fitted.layout, tangent.along[number], tangent.fitted.chain
     (pieces, m), count = layout.rows[number].shape, readings.shape[-1]
     fields = readings.reshape(pieces, m, chain.levels, chain.parts, chain.sites, count)[..., layout.plain.moving, :]
     by_state = np.zeros((pieces, m, count, chain.order, *fields.shape[3:5]))
     by_state[:, :, :, : chain.levels] = np.moveaxis(fields, -1, 2)
+    if rates is not None:
+        moving = rates.reshape(pieces, m, chain.parts, chain.sites, count)[..., layout.plain.moving, :]
+        by_state[:, :, :, 1] += np.moveaxis(moving, -1, 2)
     by_state = by_state.reshape(pieces, m, count, -1)
     back = np.swapaxes(tangent.followed.transitions[number][:, ::-1], 2, 3)
     carried = propagate(back, by_state[:, -2::-1], by_state[:, -1])[:, ::-1]

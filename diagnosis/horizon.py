@@ -233,6 +233,7 @@ class Path:
         level: the model's readings, rows of all recordings one after another (rows, channels).
         left: readings less that, NaN where nothing was read.
         own: derivatives of the readings by the field (rows, channels).
+        by_rate: those of the readings of u by v, of all recordings one after another (rows, parts, N); None for 0.
     """
 
     model: Model
@@ -241,6 +242,7 @@ class Path:
     level: Float[ndarray, "rows channels"]
     left: Float[ndarray, "rows channels"]
     own: Float[ndarray, "rows channels"]
+    by_rate: Float[ndarray, "rows parts sites"] | None
 
     @property
     def size(self) -> int:
@@ -271,7 +273,7 @@ class Followed(Path):
     @property
     def path(self) -> Path:
         """The motion alone."""
-        return Path(self.model, self.nodes, self.splines, self.level, self.left, self.own)
+        return Path(self.model, self.nodes, self.splines, self.level, self.left, self.own, self.by_rate)
 
     @property
     def local(self) -> int:
@@ -327,8 +329,9 @@ def linearised(path: Path, layout: Layout) -> Followed | None:
         return None
     slope = _slopes(path, layout, moves)
     return Followed(
-        path.model, path.nodes, path.splines, path.level, path.left, path.own, tuple(moves), tuple(transitions), slope
-    )
+        path.model, path.nodes, path.splines, path.level, path.left, path.own, path.by_rate, tuple(moves),
+        tuple(transitions), slope,
+    )  # fmt: skip
 
 
 def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "time state"]) -> ndarray:
@@ -349,7 +352,7 @@ def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "tim
     for _ in range(UNREAD):
         level, own = field[:, : chain.levels], np.ones_like(field[:, : chain.levels])
         for placed, _ in model.instruments():
-            wrong = placed.misread(t, field[:, : chain.levels])
+            wrong = placed.misread(t, field).read(chain.levels)
             level, own = level + wrong.added, own + wrong.slope
         own = np.where(np.abs(own) > LEAST_SLOPE, own, 1.0)
         field[:, : chain.levels] += (reading[:, : chain.levels] - level) / own
@@ -441,47 +444,66 @@ def fields(
 
 def _readings(
     model: Model, layout: Layout, nodes: Sequence[ndarray], splines: Sequence[ndarray | None]
-) -> tuple[ndarray, ndarray, ndarray]:
-    """Return what instruments make of a motion, what that leaves of the readings, and its derivative by the field."""
-    levels, lefts, owns = [], [], []
+) -> tuple[ndarray, ndarray, ndarray, ndarray | None]:
+    """Return what instruments make of a motion, what that leaves of the readings, and its derivatives; see `Path`."""
+    levels, lefts, owns, rates = [], [], [], []
     for number, record in enumerate(layout.records):
         rows = layout.rows[number]
-        t, field = _seen(layout, number, nodes[number], splines[number])
-        level, own = field, np.ones_like(field)
+        t, field = fields(layout, number, nodes[number], splines[number])
+        level = field[:, : layout.chain.levels]
+        own, rate = np.ones_like(level), np.zeros_like(field[:, 0])
         for placed, _ in model.instruments():
-            wrong = placed.misread(t, field)
+            wrong = placed.misread(t, field).read(layout.chain.levels)
             level, own = level + wrong.added, own + wrong.slope
+            rate = rate if wrong.by_rate is None else rate + wrong.by_rate
         seen = record.seen[rows] & layout.valid[number][..., None, None, None]
         value = np.where(seen, record.value[rows], np.nan).reshape(level.shape)
         shape = (rows.size, -1)
         levels.append(level.reshape(shape))
         lefts.append((value - level).reshape(shape))
         owns.append(own.reshape(shape))
-    return np.concatenate(levels), np.concatenate(lefts), np.concatenate(owns)
+        rates.append(rate)
+    by_rate = np.concatenate(rates)
+    level, left, own = (np.concatenate(one) for one in (levels, lefts, owns))
+    return level, left, own, by_rate if np.any(by_rate) else None
 
 
 def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
     """Return the derivatives of the readings by the initial state and the model's numbers."""
     found, begin = [], 0
     for number, rows in enumerate(layout.rows):
-        t, field = _seen(layout, number, path.nodes[number], path.splines[number])
+        t, field = fields(layout, number, path.nodes[number], path.splines[number])
         count, size = moves[number].shape[2:]
         flat = moves[number].reshape(rows.size, count, size)
-        by = np.moveaxis(layout.plain.whole(flat, None)[:, :, : layout.chain.levels], 1, -1)
+        by_field, some = layout.plain.whole(flat, None), slice(begin, begin + rows.size)
+        by = np.moveaxis(by_field[:, :, : layout.chain.levels], 1, -1)
         border = layout.borders[number]
         if border is not None:
             times = layout.records[number].times[rows]
             border.add_readings(by[..., size : size + border.size], times, layout.plain.border)
-        by = by.reshape(rows.size, -1, count) * path.own[begin : begin + rows.size, :, None]
+        by = as_read(by, by_field, path.own[some], None if path.by_rate is None else path.by_rate[some])
         begin += rows.size
         for placed, block in path.model.instruments():
-            wrong = np.moveaxis(placed.misread(t, field).by, 0, -1)
+            wrong = np.moveaxis(placed.misread(t, field).read(layout.chain.levels).by, 0, -1)
             own = count - len(path.model.numbers)
             by[..., own + block.start : own + block.stop] += wrong.reshape(rows.size, by.shape[1], -1)
         found.append(by)
     return np.concatenate(found)
 
 
-def _seen(layout: Layout, number: int, nodes: ndarray, splines: ndarray | None) -> tuple[ndarray, ndarray]:
-    t, field = fields(layout, number, nodes, splines)
-    return t, field[:, : layout.chain.levels]
+def as_read(
+    by: Float[ndarray, "rows levels parts sites count"], by_field: ndarray, own: ndarray, by_rate: ndarray | None
+) -> Float[ndarray, "rows channels count"]:
+    """Return derivatives of readings from those of what is read.
+
+    Args:
+        by: derivatives of the levels that are read.
+        by_field: the same of the motion (rows, count, order, parts, N).
+        own: derivatives of the readings by their fields, see `Path`.
+        by_rate: those by v.
+    """
+    found: ndarray = by.reshape(*own.shape, -1) * own[..., None]
+    if by_rate is not None:
+        rate = by_rate[..., None] * np.moveaxis(by_field[:, :, 1], 1, -1)
+        found[:, : by_rate[0].size] += rate.reshape(len(found), -1, found.shape[2])
+    return found

@@ -16,7 +16,7 @@ import numpy as np
 
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted, gain, left_free, whitened
-from latticebench.diagnosis.horizon import fields
+from latticebench.diagnosis.horizon import as_read, fields
 from latticebench.diagnosis.model import Assembled, Model, read_term
 from latticebench.diagnosis.normal import by_pieces, normal, scaled_inverse
 from latticebench.diagnosis.propagation import propagate
@@ -58,7 +58,7 @@ class _Along:
     Attributes:
         t: times (rows,).
         states: (rows, S).
-        field: as readings see it (rows, levels, parts, N).
+        field: the motion (rows, order, parts, N).
         driven: the sites without an equation.
         assembled: the model.
         early, late: what a force does within an interval that falls from 1 to 0, or grows from 0 to 1 (pieces, m - 1,
@@ -150,8 +150,7 @@ class Tangent:
         late = np.where(h > 0, ramp / np.where(h > 0, h, 1.0), 0.0)
         times, field = fields(layout, number, y, followed.splines[number])
         driven = layout.driven(number, followed.splines[number])
-        seen = field[:, : chain.levels]
-        return _Along(times, y.reshape(-1, size), seen, driven, assembled, unit[:, :, :, 0] - late, late)
+        return _Along(times, y.reshape(-1, size), field, driven, assembled, unit[:, :, :, 0] - late, late)
 
     def scored(self, candidates: Sequence[Placed]) -> list[Scored]:
         """Return all candidates with what they would win."""
@@ -314,11 +313,11 @@ class Tangent:
         forces = [one for one in batch if not one.instrument]
         if forces:
             z = self._moved(number, forces)
-            field = np.moveaxis(layout.plain.whole(z, None)[:, :, : chain.levels], 1, -1)
-            blocks.append(field.reshape(rows.size, -1, z.shape[1]) * self.own(number)[..., None])
+            field = layout.plain.whole(z, None)
+            blocks.append(as_read(np.moveaxis(field[:, :, : chain.levels], 1, -1), field, *self.slopes(number)))
         for one in batch:
             if one.instrument:
-                by = one.misread(along.t, along.field).by
+                by = one.misread(along.t, along.field).read(chain.levels).by
                 blocks.append(np.moveaxis(by.reshape(len(by), rows.size, -1), 0, -1))
         return np.concatenate(blocks, axis=-1)
 
@@ -334,10 +333,11 @@ class Tangent:
         z = propagate(self.followed.transitions[number], forced, still)
         return z.reshape(rows.size, len(push), -1)
 
-    def own(self, number: int) -> ndarray:
-        """Return the derivatives of one recording's readings by their own fields: (rows, channels)."""
-        begin = sum(rows.size for rows in self.fitted.layout.rows[:number])
-        return self.fitted.followed.own[begin : begin + self.fitted.layout.rows[number].size]
+    def slopes(self, number: int) -> tuple[ndarray, ndarray | None]:
+        """Return the derivatives of one recording's readings by their own fields and by v, see `horizon.Path`."""
+        begin, followed = sum(rows.size for rows in self.fitted.layout.rows[:number]), self.fitted.followed
+        some = slice(begin, begin + self.fitted.layout.rows[number].size)
+        return followed.own[some], None if followed.by_rate is None else followed.by_rate[some]
 
     def push(self, number: int, one: Placed) -> ndarray:
         """Return the forces of an effect's numbers, or of one without any, along the motion: (., rows, parts, M)."""

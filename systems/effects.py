@@ -36,6 +36,8 @@ HOW: dict[str, str] = {
     "alike; omega and site found",
     "gain": "the reading is g u; at one site, which is found, or with a g for every site",
     "curve": "the reading is u + c u^2, with one c for all sensors or at one of them",
+    "lag": "the reading is u - tau v, which is u a time tau ago; at one site, which is found, or with a tau for every "
+    "site",
     "clock": "the recorded times are wrong by a share of themselves",
 }
 """The ways of acting, each with what it does; `latticebench.diagnosis.acting` has one class for each."""
@@ -278,6 +280,11 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "sensor-curve", "u[n]**2", complex_field="abs(u[n])*u[n]", acts="curve",
         look_for="a residual in proportion to the square of the reading", source=LJUNG,
+    ),
+    Effect(
+        "sensor-lag", "v[n]", acts="lag", orders=(2,),
+        look_for="a residual in proportion to the velocity at one site, as of a filter or of channels that are scanned",
+        source=LJUNG,
     ),
     Effect(
         "clock", "v[n]", acts="clock",

@@ -195,7 +195,7 @@ class Sight:
             dynamics.sites, dynamics.order, dynamics.is_complex, levels, dynamics.ends, every, dynamics.sites - 1
         )
         scene = self._scene(chain, line)
-        field = dynamics.whole(line.nodes, None)[:, :levels]
+        field = dynamics.whole(line.nodes, None)
         every_place = (one for effect in CATALOGUE for one in way_of(effect).places(effect, scene))
         # What a zero that wanders does cannot be foreseen.
         foreseen = (one for one in every_place if one.wandering() is None)
@@ -203,7 +203,7 @@ class Sight:
         pushing = []
         for one in placed:
             if one.instrument:
-                by = one.misread(self.times, field).by[: len(one.strength)]
+                by = one.misread(self.times, field).read(levels).by[: len(one.strength)]
                 yield self._rows(np.moveaxis(self._full(by), 1, 0))
             elif (ends := one.other_ends()) is not None:
                 other = replace(self._stretches, dynamics=replace(dynamics, ends=ends))

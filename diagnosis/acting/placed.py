@@ -153,17 +153,23 @@ class InStep(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Misreading:
-    """What an instrument adds to the readings of a field.
+    """What an instrument adds to the readings of a motion.
 
     Attributes:
-        added: (rows, levels, parts, N), in units of the readings.
+        added: (rows, order, parts, N), in units of the readings; what counts are the levels that were read.
         slope: its derivative by the reading's own field, likewise; dimensionless.
-        by: its derivatives by the numbers of the effect (numbers, rows, levels, parts, N).
+        by: its derivatives by the numbers of the effect (numbers, rows, order, parts, N).
+        by_rate: derivatives of what is added to u by v (rows, parts, N), in units of time; None for 0.
     """
 
-    added: Float[ndarray, "rows levels parts sites"]
-    slope: Float[ndarray, "rows levels parts sites"]
-    by: Float[ndarray, "numbers rows levels parts sites"]
+    added: Float[ndarray, "rows order parts sites"]
+    slope: Float[ndarray, "rows order parts sites"]
+    by: Float[ndarray, "numbers rows order parts sites"]
+    by_rate: Float[ndarray, "rows parts sites"] | None = None
+
+    def read(self, levels: int) -> Misreading:
+        """Return what concerns the levels that were read."""
+        return Misreading(self.added[:, :levels], self.slope[:, :levels], self.by[:, :, :levels], self.by_rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,7 +315,7 @@ class Placed(ABC):
         return self
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:
-        """Return what the instrument makes of a field (rows, levels, parts, N)."""
+        """Return what the instrument makes of a motion: u, and where it has one, v (rows, order, parts, N)."""
         raise NotImplementedError(f"{self.effect.name} acts on the motion, not on readings")
 
     @property

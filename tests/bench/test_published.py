@@ -222,8 +222,8 @@ def test_the_page_on_the_limit_says_what_the_table_of_all_crossed_says(script: C
     page = re.sub(r"\s+", " ", words("limit"))
     for said in (
         f"the median error of `trajectory` (one seed) is {ratio['trajectory'].median():.2g} times the bound and at "
-        f"most {ratio['trajectory'].max():.2g} times, that of `weak` (ten seeds) {ratio['weak'].median():.1f} and at most "
-        f"{ratio['weak'].max():.2g} times",
+        f"most {ratio['trajectory'].max():.2g} times, that of `weak` (ten seeds) {ratio['weak'].median():.1f} and at "
+        f"most {ratio['weak'].max():.2g} times",
         f"rightly in {100 * large.loc[large['method'] == 'weak', 'right'].mean():.0f} %",
         f"loses {len(lost)} of the {noisiest['ratio'].count()} fits that have a bound",
         f"{len(table.groupby(['data', 'library']))} kinds of data, "

@@ -98,7 +98,7 @@ def test_a_hum_is_glanced_at_by_what_it_adds_to_the_readings(problem, plain):
     hums = [one for one in problem.candidates if one.effect.name == "sensor-hum"]
     for placed in (hums[3], hums[-4]):
         placed = placed.moved([0.3, -0.2, placed.frequency])
-        by = placed.misread(tangent.along[0].t, tangent.along[0].field).by
+        by = placed.misread(tangent.along[0].t, tangent.along[0].field).read(problem.chain.levels).by
         long = by.reshape(len(by), -1) @ looked.reshape(by[0].size, -1)
         short = np.zeros_like(long)
         _Pull(tangent, 0, looked).add([placed], np.array([0, len(long)]), short)

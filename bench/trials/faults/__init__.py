@@ -82,6 +82,7 @@ MISREADINGS = {
     "sensor-drift": _misread(instrument.drift),
     "sensor-wander": _misread(instrument.wander),
     "sensor-hum": _misread(instrument.humming),
+    "sensor-lag": replace(_misread(instrument.slow), only="second order"),
     # Where only u is read, another unit of time does the same.
     "clock": replace(_misread(instrument.slow_clock), only="second order"),
 }

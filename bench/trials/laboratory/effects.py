@@ -1,8 +1,8 @@
 """What is put into a chain or its sensors: which effects make sense there, how large they may be, and their parameters.
 
 Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
-"cos", "sin" and "omega" (of a drive, at all sites or at one, or of a sensor's hum), "offset_2", "gain_2" and "curve_2"
-(of the second sensor, which reads gain * u + offset + curve * u^2), and "curve" (one for all sensors).
+"cos", "sin" and "omega" (of a drive, at all sites or at one, or of a sensor's hum), "offset_2", "gain_2", "curve_2"
+and "lag_2" (of the second sensor, which reads gain * u + offset + curve * u^2 - lag * v), and "curve" (one for all).
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ LOCAL = (LOCAL_DRIVE, LOCAL_DAMPING, BOND)
 OWN_CURVE = "own-sensor-curve"
 # A sensor that hums, likewise; as fast as to be read so many times in half a period at least.
 HUM, PER_HALF = "sensor-hum", 1.25
+# A sensor that lags, likewise.
+LAG = "sensor-lag"
 # A hum that is at least so many times as fast as the chain, where it is read so often; put in where it is asked for.
 MAINS, FASTER = "mains", 6.0
 # Of Fermi, Pasta and Ulam, and of van der Pol; put in where they are asked for.
@@ -44,7 +46,7 @@ NAMES = (
 )  # fmt: skip
 # How often each is drawn, where 1 is not given: what most recordings have.
 OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
-ASKED = (*NAMES, *LOCAL, OWN_CURVE, HUM, MAINS, *CLASSIC)
+ASKED = (*NAMES, *LOCAL, OWN_CURVE, HUM, LAG, MAINS, *CLASSIC)
 """Every effect that can be asked for."""
 HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
 """Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
@@ -118,7 +120,7 @@ def sensible(chain: Chain, reach: int, names: Sequence[str] = NAMES) -> list[str
     for name in names:
         if DECLARED.get(name) in chain.declared:
             continue
-        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM, MAINS) and inner < 2:
+        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM, LAG, MAINS) and inner < 2:
             continue
         if name == BOND and not (chain.coupled and inner > 2):
             continue
@@ -170,6 +172,8 @@ def ingredient(name: str, chain: Chain, site: int, sign: float = 1.0) -> Ingredi
         return Ingredient(name, None, {"curve": sign / chain.size}, 0.15, {})
     if name == OWN_CURVE:
         return Ingredient(CURVE, site, {f"curve_{site + 1}": sign / chain.size}, 0.15, {})
+    if name == LAG:
+        return Ingredient(name, site, {f"lag_{site + 1}": 1 / chain.fast}, 0.3, {})
     if name == GAIN:
         return Ingredient(name, site, {f"gain_{site + 1}": sign}, 0.4, {})
     if name == MASSES:

@@ -82,7 +82,7 @@ def called(values: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
     """
     found = {}
     for label, (value, error) in values.items():
-        sensor, wave = re.match(r"(offset|gain|curve) of u(\d+)", label), re.match(WAVE, label)
+        sensor, wave = re.match(r"(offset|gain|curve|lag) of u(\d+)", label), re.match(WAVE, label)
         if sensor is not None:
             found[f"{sensor[1]}_{sensor[2]}"] = (value + (sensor[1] == "gain"), error)
         elif wave is not None:

@@ -247,9 +247,9 @@ class Experiment:
             )  # fmt: skip
         if found.status != 0 or not np.all(np.isfinite(found.y)):
             return None
-        u = np.moveaxis(found.y.reshape(*start.shape, -1)[0], -1, 0)
-        pairs = zip(self.times, u, strict=True)
-        return np.moveaxis(np.stack([sensors.read(float(t), held(float(t), row)) for t, row in pairs]), 0, 1)
+        u, v = np.moveaxis(found.y.reshape(*start.shape, -1), -1, 1)
+        rows = zip(self.times, u, v, strict=True)
+        return np.moveaxis(np.stack([sensors.read(float(t), held(float(t), row), by) for t, row, by in rows]), 0, 1)
 
 
 class _Table:
@@ -319,13 +319,13 @@ class _Sensors:
             return np.concatenate([of.get(f"{name}_{k + 1}", zero) for k in range(sites)], axis=1)
 
         self.offset, self.gain = row("offset"), 1 + row("gain")
-        self.curve = of.get("curve", zero) + row("curve")
+        self.curve, self.lag = of.get("curve", zero) + row("curve"), row("lag")
         sites_that_hum = [name.removeprefix("hum.cos@") for name in of if name.startswith("hum.cos")]
         self.hums = {int(k): [of[f"hum.{name}@{k}"] for name in ("cos", "sin", "omega")] for k in sites_that_hum}
 
-    def read(self, t: float, u: Float[ndarray, "copies sites"]) -> ndarray:
+    def read(self, t: float, u: Float[ndarray, "copies sites"], v: Float[ndarray, "copies sites"]) -> ndarray:
         """Return the readings."""
-        found = np.asarray(self.gain * u + self.offset + self.curve * u**2)
+        found = np.asarray(self.gain * u + self.offset + self.curve * u**2 - self.lag * v)
         for site, (cos, sin, omega) in self.hums.items():
             found[:, site] += (cos * np.cos(omega * t) + sin * np.sin(omega * t))[:, 0]
         return found
@@ -333,7 +333,7 @@ class _Sensors:
     def held(self, u: Float[ndarray, "copies sites"], outer: Sequence[int]) -> ndarray:
         """Return positions with the outer ones such that every copy has the readings of the first there.
 
-        Outer sensors do not hum.
+        Outer sensors neither hum nor lag.
         """
         if not outer:
             return u

@@ -96,8 +96,8 @@ def test_what_a_recording_cannot_tell_from_an_effect_is_said_beside_it() -> None
     assert gain.alike == ("asymmetric-coupling",)
 
 
-def moved(one: LabRecording, more: Sequence[tuple[float, str]] = ()) -> np.ndarray:
-    """Return the first sixty positions by the declared terms and some more, each a coefficient and a text."""
+def moved(one: LabRecording, more: Sequence[tuple[float, str]] = (), level: int = 0) -> np.ndarray:
+    """Return the first sixty positions, or velocities, by the declared terms and more, each a number and a text."""
     pieces = [*zip(one.coefficients.tolist(), one.declared.texts, strict=True), *more]
     term = Term(" + ".join(f"({size!r})*({text})" for size, text in pieces))
     motion = Motion(term, 2, is_complex=False, sites=one.chain.sites, ends=one.chain.ends)
@@ -106,7 +106,7 @@ def moved(one: LabRecording, more: Sequence[tuple[float, str]] = ()) -> np.ndarr
         motion.right_hand_side, (0.0, times[-1]), motion.pack(*one.chain.start), t_eval=times, method="LSODA",
         rtol=1e-10, atol=1e-10 * one.chain.size,
     )  # fmt: skip
-    return np.asarray(motion.unpack(exact.y)[0])
+    return np.asarray(motion.unpack(exact.y)[level])
 
 
 @pytest.mark.parametrize(
@@ -145,6 +145,17 @@ def test_a_curve_of_one_sensor_bends_its_readings_and_no_others() -> None:
     assert bent.site is not None
     expected = moved(one)
     expected[:, bent.site] += bent.parameters[f"curve_{bent.site + 1}"] * expected[:, bent.site] ** 2
+    np.testing.assert_allclose(expected, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
+
+
+def test_a_sensor_that_lags_reads_where_the_site_was_a_moment_ago() -> None:
+    one = make_recording(3, "white", [effects.LAG], sites=2)
+    (late,) = one.effects
+    assert late.site is not None
+    lag = late.parameters[f"lag_{late.site + 1}"]
+    assert 0 < lag * one.chain.fast <= 0.3
+    expected = moved(one)
+    expected[:, late.site] -= lag * moved(one, level=1)[:, late.site]
     np.testing.assert_allclose(expected, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
 
 

@@ -1,0 +1,60 @@
+"""A sensor that follows late."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, OfSensors, Placed, Scene
+from latticebench.systems.effects import Effect
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Lag(OfSensors, acts="lag"):
+    """The reading is u - strength * v, which is u a strength of time ago, to first order.
+
+    Filters, converters that scan their channels and cameras that are not in step do this. A filter of first order
+    reads u / (1 + omega^2 strength^2) at an angular frequency omega besides, which is a gain where the motion has
+    about one frequency. What all sensors lag by is no more than another zero of the time.
+    """
+
+    separated_by: ClassVar[str] = "a motion of other frequencies: a lag turns into another phase at each of them"
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return every sensor of several, and of more than two all but the first."""
+        chain = scene.chain
+        if chain.sites < 2 or not effect.texts(chain.order, chain.is_complex):
+            return
+        others = chain.moving[1:]
+        for sites in [*((site,) for site in chain.moving), *([others] if len(others) > 1 else [])]:
+            yield cls(effect=effect, sites=sites, strength=(0.0,) * len(sites))
+
+    @property
+    def possible(self) -> bool:
+        """Whether no single sensor is ahead of all others: these then lag."""
+        return self.site is None or self.strength[0] >= 0
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
+        """Return the columns that lag."""
+        return tuple(f"lag of u{site + 1}" for site in self.sites)
+
+    def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
+        """Return what lags add; nothing where the motion has no velocity."""
+        by, by_rate = np.zeros((len(self.strength), *field.shape)), np.zeros_like(field[:, 0])
+        if field.shape[1] > 1:
+            for k, site in enumerate(self.sites):
+                by[k, :, 0, :, site] = -field[:, 1, :, site]
+                by_rate[..., site] = -self.strength[k]
+        return Misreading(np.tensordot(self.strength, by, 1), np.zeros_like(field), by, by_rate)
+
+    def sentences(self, chain: Chain) -> list[str]:
+        """Return the lags."""
+        pairs = zip(self.labels(chain), self.strength, strict=True)
+        return [f"{label}: {value:.{DIGITS}g}" for label, value in pairs]
