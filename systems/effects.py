@@ -36,8 +36,8 @@ HOW: dict[str, str] = {
     "alike; omega and site found",
     "gain": "the reading is g u; at one site, which is found, or with a g for every site",
     "curve": "the reading is u + c u^2, with one c for all sensors or at one of them",
-    "lag": "the reading is u - tau v, which is u a time tau ago; at one site, which is found, or with a tau for every "
-    "site",
+    "lag": "the reading is u - tau v, which is u a time tau ago; at one site, which is found, with a tau for every "
+    "site, or with one more tau at each",
     "clock": "the recorded times are wrong by a share of themselves",
 }
 """The ways of acting, each with what it does; `latticebench.diagnosis.acting` has one class for each."""

@@ -88,7 +88,7 @@ def of_natural(name: str, units: Units, order: int = 2) -> tuple[float, str]:
         return 1 / units.scale, units.reading
     if name == "omega":
         return 1.0, rate_of("rad", units.time)
-    if name in TIMES or name.endswith(" time") or name.startswith("lag of "):
+    if name in TIMES or name.endswith(" time") or name.startswith("lag "):
         return 1.0, units.time
     try:
         term = Term(re.sub(IN_TIME, "", re.sub(r"(?: at site \d+|\(t-[^()]*\))$", "", name)) or "1")
@@ -134,7 +134,7 @@ def in_sentence(line: str, units: Units) -> str:
     """Return a sentence about an effect with its offset, drift or hum, or its time, in the units of the recording."""
     if re.search(r" angular frequency [\d.e+-]+$", line):
         line = with_unit(line, rate_of("rad", units.time))
-    zero = re.fullmatch(r"((?:offset|drift|walk|hum|lag) of \w+): (\S+)(.*)", line)
+    zero = re.fullmatch(r"((?:offset|drift|walk|hum|lag) of \w+|lag from one sensor to the next): (\S+)(.*)", line)
     if zero:
         factor, unit = of_natural(zero[1], units)
         return f"{zero[1]}: {with_unit(f'{float(zero[2]) * factor:.{DIGITS}g}', unit)}{zero[3]}"

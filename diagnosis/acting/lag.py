@@ -17,24 +17,35 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Lag(OfSensors, acts="lag"):
-    """The reading is u - strength * v, which is u a strength of time ago, to first order.
+    """The reading is u - tau * v, which is u a time tau ago, to first order.
 
     Filters, converters that scan their channels and cameras that are not in step do this. A filter of first order
-    reads u / (1 + omega^2 strength^2) at an angular frequency omega besides, which is a gain where the motion has
-    about one frequency. What all sensors lag by is no more than another zero of the time.
+    also reads less, by 1 + omega^2 tau^2 at an angular frequency omega: a gain, where the motion has about one
+    frequency. What all sensors lag by is no more than another zero of the time.
+
+    Attributes:
+        in_turn: whether each sensor lags behind the one before by the strength; else each site has its own.
     """
 
+    in_turn: bool = False
     separated_by: ClassVar[str] = "a motion of other frequencies: a lag turns into another phase at each of them"
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every sensor of several, and of more than two all but the first."""
+        """Return every sensor of several, and of more than two all but the first and all in turn."""
         chain = scene.chain
         if chain.sites < 2 or not effect.texts(chain.order, chain.is_complex):
             return
         others = chain.moving[1:]
         for sites in [*((site,) for site in chain.moving), *([others] if len(others) > 1 else [])]:
             yield cls(effect=effect, sites=sites, strength=(0.0,) * len(sites))
+        if len(others) > 1:
+            yield cls(effect=effect, sites=chain.moving, strength=(0.0,), in_turn=True)
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect, the sites, and whether they lag in turn."""
+        return (self.effect.name, self.sites, self.in_turn)
 
     @property
     def possible(self) -> bool:
@@ -43,15 +54,19 @@ class Lag(OfSensors, acts="lag"):
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the columns that lag."""
+        if self.in_turn:
+            return ("lag from one sensor to the next",)
         return tuple(f"lag of u{site + 1}" for site in self.sites)
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
         """Return what lags add; nothing where the motion has no velocity."""
-        by, by_rate = np.zeros((len(self.strength), *field.shape)), np.zeros_like(field[:, 0])
+        lags = np.eye(field.shape[-1])[list(self.sites)]
+        if self.in_turn:
+            lags = np.arange(len(self.sites))[None] @ lags
+        by, by_rate = np.zeros((len(lags), *field.shape)), np.zeros_like(field[:, 0])
         if field.shape[1] > 1:
-            for k, site in enumerate(self.sites):
-                by[k, :, 0, :, site] = -field[:, 1, :, site]
-                by_rate[..., site] = -self.strength[k]
+            by[:, :, 0] = -lags[:, None, None] * field[:, 1]
+            by_rate -= self.strength @ lags
         return Misreading(np.tensordot(self.strength, by, 1), np.zeros_like(field), by, by_rate)
 
     def sentences(self, chain: Chain) -> list[str]:

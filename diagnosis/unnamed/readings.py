@@ -62,8 +62,6 @@ def readings(problem: Problem) -> Iterator[Misread]:
     grows = _in_time(growing(problem.scene))
     for here in range(chain.sites):
         yield _misread("a gain that drifts", [_times(grows)], here)
-        if chain.levels > 1:
-            yield _misread("a reading that lags", [_rate], here)
     if chain.levels > 1:
         yield _misread("readings that lag", [_rate])
     yield from _between(problem)
@@ -98,7 +96,6 @@ def _between(problem: Problem) -> Iterator[Misread]:
             yield _misread("gains that grow along the chain", [_scaled(place)], both=both)
             yield _misread("another gain of one half", [_scaled((place > 0).astype(float))], both=both)
     if chain.levels > 1 and chain.sites > 3:
-        yield _misread("readings one after the other", [_lagging(np.arange(chain.sites))])
         grows, half = _in_time(growing(problem.scene)), (place > 0).astype(float)
         yield _misread("another clock of one half", [lambda t, field: (grows(t) * half * field[:, -1:], 0.0)])
 
@@ -131,10 +128,6 @@ def _late(course: Callable[[ndarray], ndarray]) -> Reading:
 
 def _scaled(factor: ndarray) -> Reading:
     return lambda _, field: (factor * field, factor)
-
-
-def _lagging(factor: ndarray) -> Reading:
-    return lambda _, field: (-factor * field[:, -1:], 0.0)
 
 
 def _rate(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001

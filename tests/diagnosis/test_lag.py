@@ -62,6 +62,14 @@ def test_a_sensor_behind_a_short_delay_lags_by_it():
     assert found.residual[1] == pytest.approx(1.0, abs=0.02)
 
 
+def test_channels_that_are_read_one_after_the_other_lag_in_turn():
+    for lag in (0.004, -0.004):
+        found, effects = named(read(tuple(lag * np.arange(4))))
+        assert (found.verdict, set(effects)) == ("explained", {"sensor-lag"})
+        value, error = effects["sensor-lag"].values["lag from one sensor to the next"]
+        assert value == pytest.approx(lag, abs=4 * error)
+
+
 @pytest.mark.slow
 def test_behind_a_filter_of_first_order_a_sensor_lags_and_reads_less():
     constant, t = 0.05, np.linspace(-2, T[-1], 168_001)
@@ -88,7 +96,7 @@ def test_a_single_sensor_cannot_lag_nor_all_alike():
     for sites in (1, 4):
         problem = Problem.of(DECLARED, 2, [read((0.0,) * sites)], [find("sensor-lag")])
         places = {one.sites for one in problem.candidates}
-        assert places == (set() if sites == 1 else {(0,), (1,), (2,), (3,), (1, 2, 3)})
+        assert places == (set() if sites == 1 else {(0,), (1,), (2,), (3,), (1, 2, 3), (0, 1, 2, 3)})
 
 
 @functools.cache
