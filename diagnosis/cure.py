@@ -107,7 +107,7 @@ def _when(factor: object) -> str:
 def corrected(model: Model, samples: Samples) -> Samples:
     """Return a recording as instruments without the model's faults would have read it; what is missing stays so.
 
-    A zero that wanders is no number, and stays.
+    A zero that wanders is no number, and stays; so does a lag where no velocities were read.
     """
     faults = [placed for placed in model.effects if placed.instrument and placed.quickened() is None]
     if not faults:

@@ -314,7 +314,7 @@ def describe(
         if np.isfinite(noise.tail):
             parts.append(f"tails of Student's t with {two_digits(noise.tail)} degrees of freedom")
         if noise.growth > 0:
-            parts.append(f"grows with the signal by {two_digits(100 * noise.growth)} %")
+            parts.append(f"grows with the signal by {two_digits(100 * noise.growth * noise.tailed)} %")
         lines[number] = ", ".join(parts)
     if len(lines) > 1 and len(set(lines.values())) == 1:
         return [f"all sensors: {next(iter(lines.values()))}".replace(WITH_OTHERS, "in common")]

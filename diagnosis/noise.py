@@ -108,7 +108,12 @@ class Noise:
 
     def deviation(self) -> Float[ndarray, " sensors"]:
         """Return the standard deviation at zero signal, in units of the readings."""
-        return self.size * (np.sqrt(self.tail / (self.tail - 2)) if np.isfinite(self.tail) else 1.0)
+        return self.size * self.tailed
+
+    @property
+    def tailed(self) -> float:
+        """The standard deviation of innovations over their scale: 1 of a Gaussian, more with heavy tails."""
+        return float(np.sqrt(self.tail / (self.tail - 2))) if np.isfinite(self.tail) else 1.0
 
     def fresh(self, step: float) -> Float[ndarray, " sensors"]:
         """Return the size of what is new after a time, in units of the readings."""

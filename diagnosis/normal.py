@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 # Directions of the numbers that the readings do not determine, as a share of the best determined one.
 UNDETERMINED = 1e-9
-# Below this share, squares have lost the digits that a covariance needs: of chaotic motion over a long piece, all
-# numbers do one thing, and little else.
-BLURRED = 1e-6
+# Below these shares, squares have lost digits that a covariance needs: of what a number does where the initial states
+# do the most of it, as in chaotic motion over a long piece, and of what numbers do that are alike.
+TAKEN, BLURRED = 1e-3, 1e-6
 # The same of the derivatives themselves, beside what the initial states do; and what arithmetic leaves of a state that
 # does nothing.
 LOST, ROUNDING = 1e-6, 1e-13
@@ -64,7 +64,9 @@ class Normal:
     def covariance(self) -> Float[ndarray, "numbers numbers"]:
         """Return the covariance of the numbers; vast where the readings do not determine them."""
         scale, values, vectors = self._scaled
-        if np.min(values, initial=1.0) < BLURRED:
+        size = self.inner[0].shape[1]
+        before = sum(np.einsum("prg,prg->g", one[:, :, size:], one[:, :, size:]) for one in self.slope)
+        if np.any(np.diag(self.matrix) < TAKEN * before) or np.min(values, initial=1.0) < BLURRED:
             return Scaled.of(self._beside_states()).covariance(LOST)
         return np.asarray((vectors / values) @ vectors.T / scale / scale[:, None])
 

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from latticebench.diagnosis.fitting import Fitted, fit
-from latticebench.diagnosis.horizon import Layout, unread
+from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.problem import Problem, course
+from latticebench.diagnosis.readout import unread
 from latticebench.methods.engine.dynamics import Factor
 
 if TYPE_CHECKING:

@@ -15,12 +15,12 @@ from latticebench.diagnosis import modes, rules
 from latticebench.diagnosis.finding import Compared, Finding, compared, findings
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.forecast import Prediction, ahead, by_noise, pooled, predict
-from latticebench.diagnosis.horizon import unread
 from latticebench.diagnosis.inputs import in_words
 from latticebench.diagnosis.instrument import dead_sensors, describe, without
 from latticebench.diagnosis.modes import Mode
 from latticebench.diagnosis.problem import Problem, derivative_share
 from latticebench.diagnosis.progress import Found, Horizon
+from latticebench.diagnosis.readout import unread
 from latticebench.diagnosis.search import Search, Watcher
 from latticebench.diagnosis.unnamed import Left, without_name
 from latticebench.diagnosis.worth import Worth, lost, misfits

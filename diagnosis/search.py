@@ -17,7 +17,7 @@ from latticebench.diagnosis import lengths, noise_parts, rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.glance import crowding, most_promising
-from latticebench.diagnosis.horizon import Layout, unread
+from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.inputs import finest, interpolations, likeliest
 from latticebench.diagnosis.mirrored import images, mirrored
 from latticebench.diagnosis.model import Model
@@ -26,6 +26,7 @@ from latticebench.diagnosis.past import past_of, settled
 from latticebench.diagnosis.pool import Pool
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.progress import Found, Horizon, Tried
+from latticebench.diagnosis.readout import unread
 from latticebench.diagnosis.regression import regressed, sustained
 from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent

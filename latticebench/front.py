@@ -111,14 +111,20 @@ class Cause(Exhibit):
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The effects that neither `model` nor `corrected` has: memory, a clock, a zero that wanders."""
-        wandering = [one.name for one in self.result.findings if one.placed.wandering() is not None]
-        return (*self._cure.left_out, *wandering)
+        """The effects that neither `model` nor `corrected` has: memory, a clock, a zero that wanders.
+
+        Without velocities a lag is one of them.
+        """
+        unread = any(one.v is None for one in self.recording.samples)
+        placed = [one.placed for one in self.result.findings]
+        staying = [one.effect.name for one in placed if one.wandering() is not None or (one.of_rate and unread)]
+        return (*self._cure.left_out, *staying)
 
     @functools.cached_property
     def corrected(self) -> Recording:
-        """The recording as it would read without the offsets, drifts, factors and bends that were found.
+        """The recording as it would read without the offsets, drifts, factors and bends that were found, and lags.
 
+        Lags stay where no velocities were read, see `left_out`.
         A sensor that always reads the same has no readings in it.
         """
         model, dead = self.result.after.model, self.result.dead

@@ -127,8 +127,8 @@ class Report(Content):
         declared, declared_stderr: coefficients of the declared terms in the last model, with standard errors.
         declared_before, declared_stderr_before: the same in the declared equation alone.
         declared_truth: their true values, or None.
-        noise: standard deviation of the noise of each sensor, in the units of its readings; of each part of a complex
-            reading.
+        noise: root mean square of what the last model leaves of each sensor, or where that is more than noise, the
+            readings' own noise; in the units of the readings, of each part of a complex one.
         noise_lines: the noise in words.
         sensors: the parts of the noise of each sensor; empty in a document of a version that did not say them.
         effects: what was added.
@@ -207,7 +207,7 @@ def content(diagnosis: Diagnosis, *, interrupted: bool = False) -> Report:
         ),
         notes=notes(diagnosis), interrupted=interrupted, partly=shortfalls(diagnosis),
         declared_units=dict(zip(after, own, strict=bool(own))),
-        sensors=dict(zip(sensors, noise_in_numbers(_read(diagnosis), units, _span(diagnosis)), strict=True)),
+        sensors=dict(zip(sensors, _sensors(diagnosis, units), strict=True)),
     )  # fmt: skip
 
 
@@ -280,17 +280,26 @@ def _noise_lines(diagnosis: Diagnosis, units: Units) -> tuple[str, ...]:
     """Return the noise in words, in the unit of the readings where it is known."""
     if not units.reading and units.scale == 1:
         return diagnosis.noise_lines
-    first, noise = diagnosis.data[0], _read(diagnosis)
-    interval = float(np.median(np.diff(first.t)))
+    first, noise, interval = diagnosis.data[0], _read(diagnosis), _interval(diagnosis)
     fields = [first.u] if len(noise.size) == first.sites or first.v is None else [first.u, first.v]
     steps = [step_of(split_parts(one[:, k], first.is_complex).ravel()) for one in fields for k in range(first.sites)]
     return tuple(noise_in_words(noise, steps, interval, first.sites, units, _span(diagnosis)))
+
+
+def _sensors(diagnosis: Diagnosis, units: Units) -> tuple[SensorNoise, ...]:
+    """Return the noise of each sensor in numbers."""
+    return noise_in_numbers(_read(diagnosis), units, _span(diagnosis), _interval(diagnosis))
 
 
 def _read(diagnosis: Diagnosis) -> Noise:
     """Return the noise of the last model; its size is NaN for sensors that were not read."""
     found = diagnosis.after.noise
     return replace(found, size=np.where(np.isnan(diagnosis.noise), np.nan, found.size))
+
+
+def _interval(diagnosis: Diagnosis) -> float:
+    """Return the usual time from one reading to the next."""
+    return float(np.median(np.diff(diagnosis.data[0].t)))
 
 
 def _span(diagnosis: Diagnosis) -> float:

@@ -20,20 +20,23 @@ class SensorNoise(Content):
     """The noise of one sensor; sizes in the units of its readings, of each part of a complex one.
 
     Attributes:
-        deviation: standard deviation at zero signal; NaN where nothing was read.
-        slow: share of the variance that is correlated in time; the rest is white.
-        slow_over: time over which it is correlated; None where there is none.
+        deviation: standard deviation at zero signal in the last model; NaN where nothing was read.
+        slow: share of the variance that is this sensor's own and correlated in time.
+        slow_over: time over which it is correlated, which may be much less than that between readings; None where
+            nothing is.
+        next: correlation of the sensor's own noise from one reading to the next.
         common: share of the variance that is in common with the other sensors; negative where this one reads it turned
             round.
         common_over: time over which that part is correlated; None where there is none or it is white.
         wander: standard deviation of the walk of its zero over the recording; 0 where it does not wander.
-        growth: share of the signal that adds to the noise in quadrature, dimensionless.
+        growth: share of the signal that adds to the deviation in quadrature, dimensionless.
         tail: degrees of freedom of Student's t; None for a Gaussian.
     """
 
     deviation: Number
     slow: Number
     slow_over: Number | None
+    next: Number
     common: Number
     common_over: Number | None
     wander: Number
@@ -41,13 +44,14 @@ class SensorNoise(Content):
     tail: Number | None
 
 
-def noise_in_numbers(noise: Noise, units: Units, span: float) -> tuple[SensorNoise, ...]:
+def noise_in_numbers(noise: Noise, units: Units, span: float, interval: float) -> tuple[SensorNoise, ...]:
     """Return the noise of each sensor, those of u before those of v.
 
     Args:
         noise: in units of the equation.
         units: of the recording.
         span: length of the recording, over which zeros wander.
+        interval: usual time from one reading to the next.
     """
     nothing = np.zeros(len(noise.size))
     walk = noise.walk if len(noise.walk) else nothing
@@ -60,9 +64,10 @@ def noise_in_numbers(noise: Noise, units: Units, span: float) -> tuple[SensorNoi
             deviation=float(deviation) / abs(units.scale),
             slow=float((1 - one_white) * (1 - one_share**2)) if memory > 0 else 0.0,
             slow_over=float(memory) if memory > 0 else None,
+            next=float((1 - one_white) * np.exp(-interval / memory)) if memory > 0 else 0.0,
             common=float(np.sign(one_share) * one_share**2),
             common_over=common_over if one_share and common_over > 0 else None,
-            wander=float(one_walk * np.sqrt(span)) / abs(units.scale), growth=noise.growth,
+            wander=float(one_walk * np.sqrt(span)) / abs(units.scale), growth=noise.growth * noise.tailed,
             tail=noise.tail if np.isfinite(noise.tail) else None,
         )
         for deviation, memory, one_white, one_share, one_walk in zip(

@@ -28,11 +28,15 @@ class Lag(OfSensors, acts="lag"):
     """
 
     in_turn: bool = False
+    of_rate: ClassVar[bool] = True
     separated_by: ClassVar[str] = "a motion of other frequencies: a lag turns into another phase at each of them"
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every sensor of several, and of more than two all but the first and all in turn."""
+        """Return each sensor of several; of more than two also all but the first, and all in turn.
+
+        Sensors of sites without an equation are taken to be on time.
+        """
         chain = scene.chain
         if chain.sites < 2 or not effect.texts(chain.order, chain.is_complex):
             return
@@ -65,7 +69,8 @@ class Lag(OfSensors, acts="lag"):
             lags = np.arange(len(self.sites))[None] @ lags
         by, by_rate = np.zeros((len(lags), *field.shape)), np.zeros_like(field[:, 0])
         if field.shape[1] > 1:
-            by[:, :, 0] = -lags[:, None, None] * field[:, 1]
+            # Missing velocities concern the sensors that lag, and no others.
+            by[:, :, 0] = np.where(lags[:, None, None] != 0, -lags[:, None, None] * field[:, 1], 0.0)
             by_rate -= self.strength @ lags
         return Misreading(np.tensordot(self.strength, by, 1), np.zeros_like(field), by, by_rate)
 

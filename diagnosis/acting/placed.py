@@ -156,7 +156,7 @@ class Misreading:
     """What an instrument adds to the readings of a motion.
 
     Attributes:
-        added: (rows, order, parts, N), in units of the readings; what counts are the levels that were read.
+        added: (rows, order, parts, N), in units of the readings; `read` cuts it to the levels that were read.
         slope: its derivative by the reading's own field, likewise; dimensionless.
         by: its derivatives by the numbers of the effect (numbers, rows, order, parts, N).
         by_rate: derivatives of what is added to u by v (rows, parts, N), in units of time; None for 0.
@@ -196,6 +196,7 @@ class Placed(ABC):
         slow: whether it is looked for on long horizons alone, whatever is seen on short ones.
         local: whether it acts at single sites, or at each differently.
         fed: whether it depends on the field at earlier times.
+        of_rate: whether what it makes of readings of u depends on v.
         separated_by: the measurement that tells this way of acting from others; nothing where none is known.
     """
 
@@ -207,6 +208,7 @@ class Placed(ABC):
     slow: ClassVar[bool] = False
     local: ClassVar[bool] = False
     fed: ClassVar[bool] = False
+    of_rate: ClassVar[bool] = False
     separated_by: ClassVar[str] = ""
 
     def __init_subclass__(cls, acts: str = "", how: str = "") -> None:

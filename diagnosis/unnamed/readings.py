@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FRINGES, CLIPPED, COURSES = (1, 2, 4, 8, 16), (0.5, 0.7, 0.85), (8, 32, 64)
 
 Reading = Callable[["ndarray", "ndarray"], tuple["ndarray", "ndarray | float"]]
-"""From times (rows,) and a field (rows, levels, parts, N) to what is added to the reading per unit of a strength, and
+"""From times (rows,) and a motion (rows, order, parts, N) to what is added to the reading per unit of a strength, and
 its derivative by the reading's own field."""
 
 

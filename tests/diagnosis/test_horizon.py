@@ -12,10 +12,11 @@ from scipy.signal import lfilter
 
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.fitting import fit
-from latticebench.diagnosis.horizon import Layout, follow, unread
+from latticebench.diagnosis.horizon import Layout, follow
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.noise import Structure
 from latticebench.diagnosis.problem import FARTHER, LONG, WINDOWS, Problem, thinned, windows
+from latticebench.diagnosis.readout import unread
 from latticebench.diagnosis.regression import regressed
 from latticebench.diagnosis.spectrum import hidden
 from latticebench.diagnosis.worth import Worth, misfits

@@ -178,10 +178,12 @@ def test_the_noise_of_each_sensor_is_said_in_the_units_of_the_readings():
     structure = Structure(own_sizes=True, growth=True, tails=True, memory=True)
     noise = Noise(np.array([0.01, 0.031 / 2**0.5]), 0.03, 4.0, np.array([0.0, 0.12]), structure)
     first, second = describe(noise, [0.0, 0.026], "deg", interval=0.11, time="s")
-    assert first == "sensor 1: 0.014 deg, tails of Student's t with 4 degrees of freedom, grows with the signal by 3 %"
+    assert (
+        first == "sensor 1: 0.014 deg, tails of Student's t with 4 degrees of freedom, grows with the signal by 4.2 %"
+    )
     assert second == (
         "sensor 2: 0.031 deg, steps of 0.026, correlated over 0.12 s (0.4 from one reading to the next), "
-        "tails of Student's t with 4 degrees of freedom, grows with the signal by 3 %"
+        "tails of Student's t with 4 degrees of freedom, grows with the signal by 4.2 %"
     )
 
 

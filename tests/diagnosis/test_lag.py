@@ -6,11 +6,14 @@ import functools
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
+import latticebench as lb
 from latticebench.diagnosis.acting import WAYS
+from latticebench.diagnosis.cure import corrected
 from latticebench.diagnosis.fitting import fit
 from latticebench.diagnosis.glance import _looked, _Pull
 from latticebench.diagnosis.horizon import Layout, follow, linearised
@@ -137,3 +140,20 @@ def test_forces_are_glanced_at_through_late_readings_as_they_are_scored():
         short = np.zeros_like(long)
         pull.add([placed], np.array([0, len(long)]), short)
         np.testing.assert_allclose(short, long, rtol=1e-9, atol=1e-9 * np.max(np.abs(long)))
+
+
+def test_without_velocities_a_lag_is_not_corrected_and_said_to_be_left_out():
+    samples = read((0.0, 0.02, 0.0))
+    frame = pd.DataFrame(np.column_stack([T, samples.u]), columns=["t", "u1", "u2", "u3"])
+    cause = lb.diagnose(lb.read(frame), lb.Model("; ".join(DECLARED.texts), order=2, ends="free"))
+    assert cause.left_out == ("sensor-lag",)
+    np.testing.assert_array_equal(cause.corrected.samples[0].u, samples.u)
+    assert any(line.startswith("lag of u2: 0.0") for line in cause.elsewhere)
+
+
+def test_a_missing_velocity_concerns_the_sensor_that_lags_alone():
+    late = WAYS["lag"](effect=find("sensor-lag"), sites=(1,), strength=(0.1,))
+    v = np.ones((4, 3))
+    v[2] = np.nan
+    found = corrected(Model(DECLARED, 2, TRUTH, (late,)), Samples(T[:4], np.zeros((4, 3)), v, ends="free"))
+    np.testing.assert_allclose(found.u, [[0, 0.1, 0], [0, 0.1, 0], [0, np.nan, 0], [0, 0.1, 0]], atol=1e-12)
