@@ -135,8 +135,23 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     still = nothing_missing(pd.read_csv(RESULTS / "loop" / "shaken" / "laboratory.csv", comment="#")).iloc[0]
     assert f"with nothing missing {share(still['false alarms'])} had" in words("diagnosis")
     assert f"and {share(still['unexplained'])} were `unexplained` or partly so" in words("diagnosis")
+    lag = pd.read_csv(RESULTS / "loop" / "lag" / "summary.csv", comment="#", dtype=str)
+    assert f"`results/loop/lag`): {share(lag['right'].iloc[0])}." in words("diagnosis")
     first, later, third = (f"{one.split(' (')[0]} of {one.split()[-1]}" for one in exact)
     assert f"in {first}, {later} and {third} laboratory recordings" in readme
+
+
+def test_the_page_on_the_diagnosis_says_what_the_table_of_white_and_slow_noise_says() -> None:
+    slow = pd.read_csv(RESULTS / "loop" / "slow" / "summary.csv", comment="#", dtype=str).iloc[0]
+    page = words("diagnosis")
+    assert f"`results/loop/slow`): {share(slow['right'])}; intervals hold the true size in" in page
+    assert f"hold the true size in {share(slow['intervals that hold'])}. With nothing" in page
+    frame = pd.read_csv(RESULTS / "loop" / "slow" / "laboratory.csv", comment="#")
+    still = nothing_missing(frame).iloc[0]
+    assert f"With nothing missing {share(still['false alarms'])} had an effect named: zeros that wander" in page
+    wrong = frame[(frame["count"] == 0) & ~frame["right"].astype(bool)]
+    assert set(wrong["sites"]) == {24}
+    assert wrong["named"].str.contains("sensor-wander").all()
 
 
 def test_the_page_on_the_diagnosis_says_how_long_laboratory_recordings_take() -> None:
