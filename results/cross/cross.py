@@ -78,8 +78,8 @@ def lost_fits(trajectory: pd.DataFrame) -> str:
     lines = [f"- {row.data} ({row.library}): {row.ratio:.2g} times the bound" for row in lost.itertuples()]
     title = (
         f"Lost fits of `trajectory` (E2 more than {LOST:g} times the bound): {len(lost)} of the {bounded} that have a "
-        f"bound. {len(trajectory) - bounded} have none, as computing it takes more memory than a case may use; of "
-        f"these, {refused} were refused, as the fit would take more, too."
+        f"bound. {len(trajectory) - bounded} have none, as computing it takes more memory than a case may use; "
+        f"{refused} fits were refused, as they would take more, too."
     )
     return "\n".join([title, *(["", *lines] if lines else []), ""])
 
