@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.noise import centred
-from latticebench.bench.report.notes import at_ends, degrees, resting, strays, turns
+from latticebench.bench.report.notes import at_ends, degrees, resting, resting_at, strays, turns
+from latticebench.diagnosis.held import freed
 from latticebench.diagnosis.instrument import of_readings, step_of
 from latticebench.diagnosis.spectrum import Spectrum
 from latticebench.methods.engine.dynamics import split_parts
@@ -149,6 +150,7 @@ def _suspicious(
     yield from resting(samples)
     yield from strays(samples)
     yield from turns(samples)
+    yield from map(resting_at, freed(samples)[1])
     span, usual = float(np.ptp(samples.t)), float(np.median(np.diff(samples.t)))
     if len(peaks):
         if 1 / max(peaks) < SPARSE * usual:

@@ -12,6 +12,7 @@ import numpy as np
 
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain, Placed, Scene, way_of
+from latticebench.diagnosis.held import Held, freed
 from latticebench.diagnosis.instrument import of_readings, quietest, step_of
 from latticebench.diagnosis.spectrum import Spectrum, hidden, lines, mean_step
 from latticebench.methods.engine.bsplines import BSplines
@@ -72,6 +73,7 @@ class Problem:
         fineness: of the curves of the sites without an equation, of `latticebench.diagnosis.border.FINENESS`.
         scene: where effects are placed.
         candidates: all effects in all places.
+        held: what was left out of recordings as they begin and end.
         unrounded: where the mean error of rounded readings has been taken away, the smallest noise with it; else 0.
     """
 
@@ -91,6 +93,7 @@ class Problem:
     degree: int = 3
     fineness: float = 1.0
     unrounded: float = 0.0
+    held: tuple[Held, ...] = ()
 
     @classmethod
     def of(cls, declared: Library, order: int, data: Sequence[Samples], catalogue: Sequence[Effect]) -> Problem:
@@ -100,6 +103,8 @@ class Problem:
             InputError: the chain is shorter than the stencil, or there is a gap that nothing can be followed through.
         """
         _check_gaps(data)
+        free = [freed(one) for one in data]
+        data, held = [one for one, _ in free], tuple(one for _, some in free for one in some)
         longest = max(data, key=lambda one: len(one.t))
         spectrum = Spectrum.of(longest)
         top = _top(spectrum, longest)
@@ -142,7 +147,7 @@ class Problem:
         nodes = tuple(plain.pack(*both) for both in states)
         return cls(
             declared, order, data, chain, plain, records, nodes, splines, spectrum, step, scene, candidates,
-            forced,
+            forced, held=held,
         )  # fmt: skip
 
     def interpolated(self, degree: int) -> Problem:

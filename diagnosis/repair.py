@@ -15,6 +15,7 @@ from latticebench.diagnosis import modes, rules
 from latticebench.diagnosis.finding import Compared, Finding, compared, findings
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.forecast import Prediction, ahead, by_noise, pooled, predict
+from latticebench.diagnosis.held import Held, freed
 from latticebench.diagnosis.inputs import in_words
 from latticebench.diagnosis.instrument import dead_sensors, describe, without
 from latticebench.diagnosis.modes import Mode
@@ -62,7 +63,8 @@ class Diagnosis:
         left: what is significant in the last residual without having a name, the best first.
         data: recordings as they were used.
         dead: sites whose sensors always read the same, which were not used.
-        used: sample times that were used, and those recorded.
+        held: what was left out of recordings in which nothing moves at first or at last.
+        used: sample times that were used, and those recorded but for the latter.
         noise: standard deviation of each sensor: u of site 1, ..., N, then v; NaN where nothing was read. It is what
             the last model leaves; where something is left in that, no more than the readings alone show.
         noise_lines: the noise of each sensor in words.
@@ -97,6 +99,7 @@ class Diagnosis:
     modes: tuple[tuple[Mode, ...], tuple[Mode, ...], tuple[Mode, ...]]
     inputs: str = ""
     dead: tuple[int, ...] = ()
+    held: tuple[Held, ...] = ()
     truth: Float[ndarray, " terms"] | None = None
 
     def against(self, truth: Float[ndarray, " terms"] | None) -> Diagnosis:
@@ -172,7 +175,7 @@ def diagnose(
     # More threads than this are slower on matrices of these sizes.
     with threadpool_limits(1):
         problem, dead = _problem(declared, order, shown, catalogue)
-        held_out = [without_halves(without(one, dead)) for one in held_out]
+        held_out = [freed(without_halves(without(one, dead)))[0] for one in held_out]
         search = Search(problem, functools.partial(_say, data[0].source, watcher))
         found = None
 
@@ -181,7 +184,7 @@ def diagnose(
         def foreseen(fitted: Fitted) -> list[Prediction]:
             return predict(fitted, search.problem, held_out)
 
-        recorded = sum(len(one.t) for one in shown)
+        recorded = sum(len(one.t) for one in shown) - sum(one.rows for one in problem.held)
         try:
             for step in search.horizons():
                 # A model that loses the readings over longer pieces is judged by those that it can follow.
@@ -389,7 +392,7 @@ def _diagnosis(
         criterion=(0.0, more * float(np.log(after.layout.readings())) - gain),
         declared=both(lambda one: np.array(one.model.coefficients[:count])),
         modes=(modes.of_recording(problem), modes.of_model(before), modes.of_model(after)),
-        inputs=in_words(problem), dead=dead,
+        inputs=in_words(problem), dead=dead, held=problem.held,
     )  # fmt: skip
 
 

@@ -11,9 +11,10 @@ FALSE_DOUBT = 0.005
 # Nats by which something without a name must be better than named effects in their place to cast doubt on them: that an
 # effect has a name makes it so much likelier before anything is read.
 NAMED = 5.0
-# Nats that an effect must bring besides if it has a number of its own for every site: it does the work of many others.
+# Nats that an effect must bring besides if it has a number of its own for every site or bond: it does the work of many
+# others.
 STAND_IN = 10.0
-STAND_INS = frozenset({"disorder"})
+STAND_INS = frozenset({"disorder", "unequal-bonds"})
 # A wave or a pulse has to stand out from its surroundings: its price is as many times as high as others beside it win
 # what noise lets them, for where an equation misfits, every frequency or time near by wins something. Beside a wave are
 # those from so many steps of half a resolution away, where a line has fallen to a hundredth, up to so many; beside a
@@ -86,6 +87,10 @@ IN_COMMON = 2.0
 # Nats that a white part of the noise beside a slow one must win beyond Schwarz' penalty: a zero that comes and goes
 # beside an amplifier's hiss is no force, but both together could do the work of a weak one.
 BESIDE_WHITE = 2.0
+# A lattice is held where nothing moves for so many periods of its main frequency as a recording begins or ends, and a
+# sensor reads something else than in the mean of the motion, by this share of its standard deviation. A free swing is
+# gone from its turning point within a quarter of a period.
+HELD, AWAY = 0.25, 0.1
 # A forecast is worse where its error grows by more than this share of itself and is more than so many times the noise:
 # with fewer readings every number more costs a little.
 WORSE, BEYOND_NOISE = 0.05, 2.0

@@ -463,7 +463,7 @@ class Search:
     def screened(self, fitted: Fitted, *, timed: bool = True) -> list[Scored]:
         """Return the candidates whose score is above their price, the best first."""
         present = {one.place for one in fitted.model.effects if not one.timed}
-        absent = [one for one in self.open if one.place not in present and not one.timed]
+        absent = [one for one in self.open if one.place not in present and not (one.timed or one.general)]
         tangent, own = self.tangent(fitted), Worth(self.problem, fitted)
         if timed:
             past = past_of(self.problem, fitted.layout, fitted.model, fitted.followed.nodes)

@@ -27,15 +27,18 @@ HOW: dict[str, str] = {
     "one site": "the formula at one site only; site found",
     "one bond": "the formula at one site, and its mirror image, n+1 and n-1 exchanged, at the next; site found",
     "every site": "the formula at every site with a coefficient of its own",
+    "every bond": "the formula at one site of each bond, and its mirror image, n+1 and n-1 exchanged, at the "
+    "other, with a coefficient for each bond",
     "one equation": "the whole right-hand side of one site is scaled; site found",
     "ends": "the chain ends in another way than declared",
     "offset": "the reading is u + b; at one site, which is found, or with a b for every site",
     "drift": "the reading is u + d (t - t_0) / T, T being the recording's length; at one site, which is found",
+    "jump": "the reading is u + b from one time on; at one site; time and site found",
     "wander": "the reading is u + w(t), w wandering at random, more slowly than the sites swing; at one site, found",
     "hum": "the reading is u + a cos(omega s) + b sin(omega s), s counted from the middle; at one site or at all "
     "alike; omega and site found",
     "gain": "the reading is g u; at one site, which is found, or with a g for every site",
-    "curve": "the reading is u + c u^2, with one c for all sensors or at one of them",
+    "curve": "the reading is u + c T(u), T being a power, with one c for all sensors or at one of them",
     "lag": "the reading is u - tau v, which is u a time tau ago; at one site, which is found, with a tau for every "
     "site, or with one more tau at each",
     "clock": "the recorded times are wrong by a share of themselves",
@@ -242,6 +245,11 @@ CATALOGUE: tuple[Effect, ...] = (
         look_for="a residual of opposite sign at two neighbours", source=BRAUN,
     ),
     Effect(
+        "unequal-bonds", "u[n+1]-u[n]", acts="every bond",
+        look_for="a residual of each bond's own, of opposite sign at its two ends",
+        source="Dyson, Phys. Rev. 92, 1331 (1953)",
+    ),
+    Effect(
         "local-damping", "v[n]", acts="one site", orders=(2,),
         look_for="amplitudes that fall fastest where one site moves most", source=NAYFEH,
     ),
@@ -269,6 +277,10 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect("sensor-offset", "1", acts="offset", look_for="a residual that does not change in time", source=LJUNG),
     Effect("sensor-drift", "1", acts="drift", look_for="one sensor's residual that changes slowly", source=LJUNG),
     Effect(
+        "sensor-jump", "1", acts="jump", look_for="one sensor's residual that moves at one time, and stays",
+        source=LJUNG,
+    ),
+    Effect(
         "sensor-wander", "1", acts="wander", look_for="one sensor's residual that goes its own slow way",
         source="Durbin & Koopman, Time Series Analysis by State Space Methods (2012), section 2.2",
     ),
@@ -280,6 +292,11 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "sensor-curve", "u[n]**2", complex_field="abs(u[n])*u[n]", acts="curve",
         look_for="a residual in proportion to the square of the reading", source=LJUNG,
+    ),
+    Effect(
+        "sensor-saturation", "u[n]**3", complex_field="abs(u[n])**2*u[n]", acts="curve",
+        look_for="large swings that read too small, or too large, to both sides, as through a lens",
+        source="Brown, Photogramm. Eng. 32, 444 (1966)",
     ),
     Effect(
         "sensor-lag", "v[n]", acts="lag", orders=(2,),

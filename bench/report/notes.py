@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
+    from latticebench.diagnosis.held import Held
     from latticebench.diagnosis.repair import Diagnosis
     from latticebench.systems.lattice import Library
 
@@ -184,6 +185,8 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
             f"{', '.join(dead[:NAMED])}{more}: always the same reading, which is taken for a sensor that does not "
             "work; what it reads was left out, and its site moves as the equation says."
         )
+    for held in diagnosis.held:
+        yield resting_at(held)
     for samples in _joined(diagnosis.data):
         for line in doubts([samples], diagnosis.before.model.declared):
             yield f"{samples.source}: {line}."
@@ -199,6 +202,15 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
         )
     if diagnosis.inputs:
         yield f"Between its samples the measured input was taken as {diagnosis.inputs}, which the readings suit best."
+
+
+def resting_at(held: Held) -> str:
+    """Return how long a recording shows no motion, and what a diagnosis makes of it."""
+    what, rows = ("as before it is let go", "first") if held.early else ("caught or stuck", "last")
+    return (
+        f"{held.source}: nothing moves from t = {held.begin:g} to {held.end:g}, away from the middle of the motion, "
+        f"{what}: a diagnosis leaves the {rows} {held.rows} readings out."
+    )
 
 
 def _joined(data: Sequence[Samples]) -> Iterator[Samples]:

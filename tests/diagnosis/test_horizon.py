@@ -101,7 +101,7 @@ def test_a_model_that_runs_away_is_not_followed():
     assert followed(problem, layout, Model(DECLARED, 2, (-300.0, 200.0))) is None
 
 
-@pytest.mark.parametrize("name", ["sensor-offset", "sensor-gain", "sensor-curve"])
+@pytest.mark.parametrize("name", ["sensor-offset", "sensor-gain", "sensor-curve", "sensor-saturation"])
 @pytest.mark.parametrize("velocities", [False, True])
 def test_unread_undoes_what_instruments_do(name, velocities):
     problem = Problem.of(DECLARED, 2, [recording(EVEN, 0.0, velocities=velocities)], CATALOGUE)

@@ -15,7 +15,7 @@ damping quadratic-drag dry-friction nonlinear-damping onsite-linear onsite-quadr
 constant-force drive parametric-drive known-input gradient trap memory kick next-neighbour quadratic-coupling
 bond-damping nonlinear-coupling asymmetric-coupling intersite-nonlinearity long-range nonlinear-loss gain-loss defect
 bond-defect local-damping local-drive local-kick unequal-masses ends disorder sensor-offset sensor-gain sensor-curve
-sensor-drift sensor-wander sensor-hum clock
+sensor-drift sensor-wander sensor-hum clock unequal-bonds sensor-jump sensor-saturation
 """
 REAL = {"damping", "nonlinear-damping", "bond-damping", "nonlinear-loss", "gain-loss"}
 LATTICES = [(1, False), (1, True), (2, False), (2, True)]

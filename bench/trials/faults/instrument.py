@@ -38,6 +38,18 @@ def curve(setting: Setting, size: float) -> Fields:
     return bent, None if v is None else v * (1 + 2 * size * u)
 
 
+def lens(setting: Setting, size: float) -> Fields:
+    """Compress or stretch the scale at both ends: u + size u^3, of a complex field u + size |u|^2 u."""
+    u, v = setting.run()
+    return u + size * np.abs(u) ** 2 * u, None if v is None else v * (1 + 3 * size * u**2)
+
+
+def knocked(setting: Setting, size: float) -> Fields:
+    """Move the zero of one sensor of u at one time."""
+    u, v = setting.run()
+    return u + size * (setting.times > setting.drawn.about["at"])[:, None] * setting.one, v
+
+
 def drift(setting: Setting, size: float) -> Fields:
     """Move the zero of one sensor of u steadily, by the size over the record."""
     u, v = setting.run()

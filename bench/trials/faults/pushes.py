@@ -165,6 +165,7 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "local-drive": lambda m: m.wave() * np.eye(len(m.u))[m.drawn.site],
     "local-kick": lambda m: m.pulse() * np.eye(len(m.u))[m.drawn.site],
     "disorder": lambda m: m.drawn.each * m.u,
+    "unequal-bonds": lambda m: m.drawn.bonds @ m.u,
 }
 
 # Outside the catalogue; those called wavy and uneven have a form that is drawn, so that no list of terms can hold it.
@@ -176,7 +177,6 @@ PLAIN: dict[str, Callable[[Moment], ndarray]] = {
     "other: wavy-force": lambda m: m.waves(np.abs(m.u)) * (m.u if m.chain.is_complex else 1),
     "other: wavy-drag": lambda m: -m.waves(np.abs(m.v)) * m.v,
     "other: wavy-bonds": lambda m: sum(m.waves(np.abs(m.stretch(k))) * m.stretch(k) for k in (-1, 1)),
-    "other: uneven-bonds": lambda m: m.drawn.bonds @ m.u,
     "other: sudden-coupling": lambda m: float(m.t > m.drawn.about["at"]) * (m.stretch(1) + m.stretch(-1)),
     "other: late-push": lambda m: float(m.t > m.drawn.about["at"]) * np.eye(len(m.u))[m.drawn.site],
 }

@@ -1,8 +1,9 @@
 """What is put into a chain or its sensors: which effects make sense there, how large they may be, and their parameters.
 
 Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
-"cos", "sin" and "omega" (of a drive, at all sites or at one, or of a sensor's hum), "offset_2", "gain_2", "curve_2"
-and "lag_2" (of the second sensor, which reads gain * u + offset + curve * u^2 - lag * v), and "curve" (one for all).
+"cos", "sin" and "omega" (of a drive, at all sites or at one, or of a sensor's hum), "offset_2", "gain_2", "curve_2",
+"lag_2" and "jump_2" (of the second sensor, which reads gain * u + offset + curve * u^2 - lag * v, and from the time
+"when" on jump more), "curve" and "cubic" (one for all, the latter of u^3), and "bond_2" (from the second site on).
 """
 
 from __future__ import annotations
@@ -28,8 +29,10 @@ LOCAL = (LOCAL_DRIVE, LOCAL_DAMPING, BOND)
 OWN_CURVE = "own-sensor-curve"
 # A sensor that hums, likewise; as fast as to be read so many times in half a period at least.
 HUM, PER_HALF = "sensor-hum", 1.25
-# A sensor that lags, likewise.
-LAG = "sensor-lag"
+# A sensor that lags, one that is knocked, and all that see through a lens, likewise.
+LAG, JUMP, LENS = "sensor-lag", "sensor-jump", "sensor-saturation"
+# Springs of which no two are alike, likewise.
+BONDS, FEWEST_BONDS = "unequal-bonds", 3
 # A hum that is at least so many times as fast as the chain, where it is read so often; put in where it is asked for.
 MAINS, FASTER = "mains", 6.0
 # Of Fermi, Pasta and Ulam, and of van der Pol; put in where they are asked for.
@@ -46,7 +49,7 @@ NAMES = (
 )  # fmt: skip
 # How often each is drawn, where 1 is not given: what most recordings have.
 OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
-ASKED = (*NAMES, *LOCAL, OWN_CURVE, HUM, LAG, MAINS, *CLASSIC)
+ASKED = (*NAMES, *LOCAL, BONDS, OWN_CURVE, HUM, LAG, JUMP, LENS, MAINS, *CLASSIC)
 """Every effect that can be asked for."""
 HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
 """Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
@@ -82,8 +85,10 @@ class Ingredient:
 
     def key(self, parameter: str) -> str:
         """Return the name of one of its parameters among all of a chain's, see `Chain.rate`."""
-        if self.name == HUM:
-            return f"hum.{parameter}@{self.site}"
+        if self.name in (HUM, JUMP):
+            return f"{self.name.removeprefix('sensor-')}.{parameter.partition('_')[0]}@{self.site}"
+        if self.name == BONDS:
+            return f"{BOND}@{int(parameter.partition('_')[2]) - 1}"
         if self.name in (DRIVE, LOCAL_DRIVE):
             return f"drive.{parameter}" + ("" if self.site is None else f"@{self.site}")
         if self.name == "disorder":
@@ -120,9 +125,11 @@ def sensible(chain: Chain, reach: int, names: Sequence[str] = NAMES) -> list[str
     for name in names:
         if DECLARED.get(name) in chain.declared:
             continue
-        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM, LAG, MAINS) and inner < 2:
+        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM, LAG, JUMP, MAINS) and inner < 2:
             continue
         if name == BOND and not (chain.coupled and inner > 2):
+            continue
+        if name == BONDS and not (chain.coupled and not reach and inner > FEWEST_BONDS):
             continue
         if name in COUPLED and not (chain.coupled and chain.sites >= 2):
             continue
@@ -148,6 +155,13 @@ def draw_ingredient(name: str, chain: Chain, reach: int, draw: np.random.Generat
         return _offset(chain, inner, draw)
     if name == GAIN:
         return _gain(chain, inner, draw)
+    if name == JUMP:
+        when = chain.span * draw.uniform(0.15, 0.85)
+        return Ingredient(name, site, {f"jump_{site + 1}": sign * chain.size}, 1.0, {"when": float(when)})
+    if name == BONDS:
+        each = chain.coupling * draw.normal(size=chain.sites - 1)
+        each -= np.mean(each)
+        return Ingredient(name, None, {f"bond_{k + 1}": float(value) for k, value in enumerate(each)}, 0.3, {})
     if name in (HUM, MAINS):
         phase = draw.uniform(0, 2 * np.pi)
         read = np.pi / PER_HALF * (chain.readings - 1) / chain.span
@@ -172,6 +186,8 @@ def ingredient(name: str, chain: Chain, site: int, sign: float = 1.0) -> Ingredi
         return Ingredient(name, None, {"curve": sign / chain.size}, 0.15, {})
     if name == OWN_CURVE:
         return Ingredient(CURVE, site, {f"curve_{site + 1}": sign / chain.size}, 0.15, {})
+    if name == LENS:
+        return Ingredient(name, None, {"cubic": sign / chain.size**2}, 0.2, {})
     if name == LAG:
         return Ingredient(name, site, {f"lag_{site + 1}": 1 / chain.fast}, 0.3, {})
     if name == GAIN:

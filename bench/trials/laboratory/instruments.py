@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 Kind = Literal[
     "white", "heavy-tailed", "coloured", "coarse", "proportional", "unequal", "spikes", "gaps", "drifting-zero",
-    "jittered-gaps", "shaken", "slow",
+    "jittered-gaps", "shaken", "slow", "held",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = (
     "white", "heavy-tailed", "coloured", "coarse", "proportional", "unequal", "spikes", "gaps",
 )  # fmt: skip
 HELD_OUT: tuple[Kind, ...] = ("drifting-zero", "jittered-gaps")
 # All there are; those that are not among `KINDS` come only where they are asked for.
-EVERY_KIND: tuple[Kind, ...] = (*KINDS, *HELD_OUT, "shaken", "slow")
+EVERY_KIND: tuple[Kind, ...] = (*KINDS, *HELD_OUT, "shaken", "slow", "held")
 QUIETEST, LOUDEST = 0.002, 0.05
 # Rounded times have so many values in an interval.
 DIGITS = 200
@@ -53,6 +53,7 @@ class Instrument:
         uneven: by what share of the interval times differ from even ones.
         gone: share of the readings that are missing.
         cells: whether what is missing is single cells rather than rows.
+        held: for how many slow periods of the chain the recording shows it held at its start before that.
         digits: whether times are recorded rounded, to the interval over `DIGITS`.
     """
 
@@ -73,6 +74,7 @@ class Instrument:
     uneven: float = 0.0
     gone: float = 0.0
     cells: bool = False
+    held: float = 0.0
     digits: bool = False
 
     def scale(self, clean: Float[ndarray, "time sites"], rms: float) -> Float[ndarray, "time sites"]:
@@ -176,6 +178,13 @@ class Instrument:
         apart = np.concatenate([[True], np.diff(told) > 0.5 * step / DIGITS])
         return taken[apart], told[apart]
 
+    def before(self, taken: ndarray, clean: ndarray, period: float) -> tuple[ndarray, ndarray]:
+        """Return times and clean readings with those before them in which a hand holds the chain at its start."""
+        step = float(taken[1] - taken[0])
+        rows = int(self.held * period / step)
+        early = taken[0] + step * np.arange(-rows, 0)
+        return np.concatenate([early, taken]), np.concatenate([np.repeat(clean[:1], rows, axis=0), clean])
+
     def missing(self, readings: int, sites: int, draw: np.random.Generator) -> Bool[ndarray, "time sites"]:
         """Return which readings are missing: single cells, or whole rows in a few stretches."""
         gone = np.zeros((readings, sites), dtype=bool)
@@ -238,6 +247,8 @@ def draw_instrument(draw: np.random.Generator, sites: int, kind: Kind) -> Instru
             )  # fmt: skip
         case "slow":
             return replace(plain, slow=float(draw.uniform(0.3, 0.8)), memory=float(draw.uniform(0.8, 0.98)))
+        case "held":
+            return replace(plain, held=float(draw.uniform(0.4, 4.0)))
         case "jittered-gaps":
             return replace(
                 _with_gaps(plain, draw, 1), uneven=float(draw.uniform(0.1, 0.45)), digits=bool(draw.uniform() < 0.5)

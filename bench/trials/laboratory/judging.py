@@ -28,19 +28,19 @@ if TYPE_CHECKING:
     from latticebench.diagnosis.repair import Diagnosis
 
 # Effects of which one may be found at several sensors.
-ONE_FOR_ALL = ("sensor-offset", "sensor-gain", "sensor-curve")
+ONE_FOR_ALL = ("sensor-offset", "sensor-gain", "sensor-curve", "sensor-saturation")
 # What an instrument of a kind does by itself: a finding says so, or the noise model holds it.
 OF_INSTRUMENT = {"drifting-zero": ("sensor-drift", "sensor-wander")}
 # The power of the unit of u by which the parameters of effects grow, where it is not 0.
 POWERS = {
     "onsite-quadratic": -1, "onsite-cubic": -2, "onsite-quintic": -4, "quadratic-coupling": -1,
     "nonlinear-coupling": -2, "quadratic-drag": -1, "nonlinear-damping": -2, "dry-friction": 1, "constant-force": 1,
-    "drive": 1, "local-drive": 1, "sensor-curve": -2, "sensor-gain": -1,
+    "drive": 1, "local-drive": 1, "sensor-curve": -2, "sensor-saturation": -3, "sensor-gain": -1,
 }  # fmt: skip
 # The label of a wave, and minus the time since which its phase is counted.
 WAVE = r"(?:hum of u\d*, )?(cos|sin)\(.*\*(?:t|\(t([+-][^()]*)\))\)"
 # Labels of values that are no coefficient of a term, with the names that recordings have for them.
-NAMED = {"omega": "omega", "curve of u": "curve", "scale": "scale"}
+NAMED = {"omega": "omega", "curve of u": "curve", "cubic curve of u": "cubic", "scale": "scale"}
 # Half the width of a 95 % interval, in standard errors.
 HALF = 1.959964
 # A forecast is worse when its error has grown by more than this share of itself.
@@ -82,7 +82,7 @@ def called(values: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
     """
     found = {}
     for label, (value, error) in values.items():
-        sensor, wave = re.match(r"(offset|gain|curve|lag) of u(\d+)", label), re.match(WAVE, label)
+        sensor, wave = re.match(r"(offset|gain|curve|lag|jump) of u(\d+)", label), re.match(WAVE, label)
         if sensor is not None:
             found[f"{sensor[1]}_{sensor[2]}"] = (value + (sensor[1] == "gain"), error)
         elif wave is not None:

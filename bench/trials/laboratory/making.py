@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -156,6 +156,8 @@ def _attempt(draw: np.random.Generator, wanted: _Wanted, seed: int) -> LabRecord
     """Return a recording, or None where this draw gives none."""
     chain = draw_chain(draw, wanted.sites)
     instrument = draw_instrument(draw, chain.sites, wanted.instrument)
+    if instrument.held:
+        chain = replace(chain, start=chain.start * [[1.0], [0.0]])
     told: Ends = chain.ends
     if (chain.sites == 1 or chain.sites >= 5) and draw.uniform() < 0.35:
         told = "unknown"
@@ -170,14 +172,16 @@ def _attempt(draw: np.random.Generator, wanted: _Wanted, seed: int) -> LabRecord
     effects = _effects(experiment, chosen, amounts, sight, border)
     if effects is None:
         return None
-    noisy = instrument.read(sight.clean, taken, sight.rms, draw)
-    noise = np.sqrt(np.mean((noisy - sight.clean) ** 2, axis=0))
-    noisy[gone] = np.nan
+    taken, clean = instrument.before(taken, sight.clean, 2 * np.pi / chain.slow)
+    recorded = np.concatenate([taken[: len(taken) - len(recorded)], recorded])
+    noisy = instrument.read(clean, taken, sight.rms, draw)
+    noise = np.sqrt(np.mean((noisy - clean) ** 2, axis=0))
+    noisy[len(clean) - len(gone) :][gone] = np.nan
     kept = ~np.all(np.isnan(noisy), axis=1)
     return LabRecording(
         Samples(recorded[kept], noisy[kept], source=f"laboratory {seed}", ends=told),
         library("declared", list(chain.declared)), 2, effects,
-        chain.coefficients, sight.clean[kept], noise, wanted.instrument, chain, seed,
+        chain.coefficients, clean[kept], noise, wanted.instrument, chain, seed,
     )  # fmt: skip
 
 
@@ -295,7 +299,7 @@ def _beside(experiment: Experiment, chosen: Sequence[Ingredient], amounts: ndarr
         of.update({one.key(name): value for name, value in one.values(float(amount)).items()})
     offsets, gains = ([of.get(f"{name}_{k + 1}", 0.0) for k in range(chain.sites)] for name in ("offset", "gain"))
     outer = [k for k in range(chain.sites) if not reach <= k < chain.sites - reach]
-    if any(name.startswith("curve") for name in of) or not any(offsets[k] for k in outer):
+    if any(name.startswith(("curve", "cubic")) for name in of) or not any(offsets[k] for k in outer):
         return {}
     moved = chain.displaced(
         {k: offsets[k] / (1 + gains[k]) for k in outer}, {name: np.array([[value]]) for name, value in of.items()}

@@ -320,26 +320,32 @@ class _Sensors:
 
         self.offset, self.gain = row("offset"), 1 + row("gain")
         self.curve, self.lag = of.get("curve", zero) + row("curve"), row("lag")
+        self.cubic = of.get("cubic", zero)
+        jumping = [name.removeprefix("jump.jump@") for name in of if name.startswith("jump.jump")]
+        self.jumps = {int(k): [of[f"jump.{name}@{k}"] for name in ("jump", "when")] for k in jumping}
         sites_that_hum = [name.removeprefix("hum.cos@") for name in of if name.startswith("hum.cos")]
         self.hums = {int(k): [of[f"hum.{name}@{k}"] for name in ("cos", "sin", "omega")] for k in sites_that_hum}
 
     def read(self, t: float, u: Float[ndarray, "copies sites"], v: Float[ndarray, "copies sites"]) -> ndarray:
         """Return the readings."""
-        found = np.asarray(self.gain * u + self.offset + self.curve * u**2 - self.lag * v)
+        found = np.asarray(self.gain * u + self.offset + self.curve * u**2 + self.cubic * u**3 - self.lag * v)
         for site, (cos, sin, omega) in self.hums.items():
             found[:, site] += (cos * np.cos(omega * t) + sin * np.sin(omega * t))[:, 0]
+        for site, (jump, when) in self.jumps.items():
+            found[:, site] += np.where(t > when, jump, 0.0)[:, 0]
         return found
 
     def held(self, u: Float[ndarray, "copies sites"], outer: Sequence[int]) -> ndarray:
         """Return positions with the outer ones such that every copy has the readings of the first there.
 
-        Outer sensors neither hum nor lag.
+        Outer sensors neither hum, lag nor jump.
         """
         if not outer:
             return u
         first = u[0]
         wrong = (self.gain - self.gain[0]) * first + self.offset - self.offset[0]
-        wrong = wrong + (self.curve - self.curve[0]) * first**2
+        wrong = wrong + (self.curve - self.curve[0]) * first**2 + (self.cubic - self.cubic[0]) * first**3
+        steepness = self.gain[0] + 2 * self.curve[0] * first + 3 * self.cubic[0] * first**2
         found = u.copy()
-        found[:, outer] = (first - wrong / (self.gain[0] + 2 * self.curve[0] * first))[:, outer]
+        found[:, outer] = (first - wrong / steepness)[:, outer]
         return found

@@ -87,7 +87,7 @@ def test_an_effect_of_the_catalogue_leaves_nothing_of_itself(name: str, effect: 
 
 def test_what_no_effect_of_the_catalogue_does_is_apart_from_it() -> None:
     setting, _, sight = scene("phi4")
-    line = sight.fitted(FAULTS["other: uneven-bonds"].fields(setting, 0.1))
+    line = sight.fitted(FAULTS["other: wavy-bonds"].fields(setting, 0.1))
     assert sight.apart(line) > 0.5 * line.size
 
 

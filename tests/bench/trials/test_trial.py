@@ -32,7 +32,7 @@ def test_the_suite_loop_has_every_effect_of_the_catalogue() -> None:
     missing = {effect.name for effect in CATALOGUE} - there
     # Other names for a term that the declared equations of the paper's lattices have already.
     assert missing <= {"nonlinear-loss"}
-    assert {"none", "other: uneven-bonds", "damping+drive"} <= there
+    assert {"none", "other: wavy-bonds", "damping+drive"} <= there
 
 
 @pytest.mark.parametrize(
@@ -169,10 +169,10 @@ def test_a_name_in_a_group_of_three_is_not_right() -> None:
     assert is_right("damping", ["quadratic-drag"], [["damping"]], "explained")
     assert not is_right("damping", ["quadratic-drag"], [["damping", "memory"]], "explained")
     assert not is_right("none", ["damping"], [[]], "explained")
-    assert not is_right("other: uneven-bonds", ["damping"], [[]], "explained")
-    assert is_right("other: uneven-bonds", ["damping"], [[]], "partly explained")
+    assert not is_right("other: wavy-bonds", ["damping"], [[]], "explained")
+    assert is_right("other: wavy-bonds", ["damping"], [[]], "partly explained")
     assert is_right("damping+drive", ["drive", "damping"], [[], []], "explained")
-    assert not is_right("other: uneven-bonds", [], [], "nothing missing")
+    assert not is_right("other: wavy-bonds", [], [], "nothing missing")
 
 
 def test_what_an_effect_of_the_catalogue_could_do_as_well_is_counted_apart() -> None:
