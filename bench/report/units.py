@@ -84,7 +84,7 @@ def of_natural(name: str, units: Units, order: int = 2) -> tuple[float, str]:
     if re.match(r"(walk|hum) of \w+$", name):
         # A standard deviation has no sign, nor has how far a hum goes to either side.
         return 1 / abs(units.scale), units.reading
-    if name.startswith(("offset of ", "drift of ", "hum of ")):
+    if name.startswith(("offset of ", "drift of ", "hum of ", "jump of ")):
         return 1 / units.scale, units.reading
     if name == "omega":
         return 1.0, rate_of("rad", units.time)
@@ -131,10 +131,10 @@ def of_coefficients(terms: Sequence[Term], order: int, units: Units) -> list[str
 
 
 def in_sentence(line: str, units: Units) -> str:
-    """Return a sentence about an effect with its offset, drift or hum, or its time, in the units of the recording."""
+    """Return a sentence about an effect with its offset, drift, jump or hum, or its time, in the units of the recording."""
     if re.search(r" angular frequency [\d.e+-]+$", line):
         line = with_unit(line, rate_of("rad", units.time))
-    zero = re.fullmatch(r"((?:offset|drift|walk|hum|lag) of \w+|lag from one sensor to the next): (\S+)(.*)", line)
+    zero = re.fullmatch(r"((?:offset|drift|walk|hum|lag|jump) of \w+|lag from one sensor to the next): (\S+)(.*)", line)
     if zero:
         factor, unit = of_natural(zero[1], units)
         return f"{zero[1]}: {with_unit(f'{float(zero[2]) * factor:.{DIGITS}g}', unit)}{zero[3]}"

@@ -16,6 +16,7 @@ MIRRORED = Units(time="s", reading="mm", equation="m", scale=-0.001)
     [
         ("offset of u1: 0.02", "offset of u1: -20 mm"),
         ("drift of u3: -0.5 over the recording", "drift of u3: 500 mm over the recording"),
+        ("jump of u3: -0.5 at t = 17.2", "jump of u3: 500 mm at t = 17.2"),
         # A standard deviation has no sign, whichever way the sensor counts.
         ("walk of u2: 0.5 over the recording, and so on", "walk of u2: 500 mm over the recording, and so on"),
         (
