@@ -36,6 +36,8 @@ class Curve(OfSensors, acts="curve"):
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return all sensors alike, and every one of several, without and with velocities.
 
+        A sensor of a site without an equation would have what the curve of that site does not follow.
+
         Raises:
             InputError: the formula is no power of u[n] from 2 on.
         """
@@ -50,7 +52,7 @@ class Curve(OfSensors, acts="curve"):
             )
         every = tuple(range(chain.sites))
         for both in (False, True)[: chain.levels]:
-            for sites in [every, *((site,) for site in every if chain.sites > 1)]:
+            for sites in [every, *((site,) for site in chain.moving if chain.sites > 1)]:
                 yield cls(effect=effect, sites=sites, power=int(power[1]), both=both, strength=(0.0,))
 
     @property

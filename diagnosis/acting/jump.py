@@ -64,11 +64,11 @@ class Jump(OfSensors, acts="jump"):
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every site at times all over the recording."""
+        """Return every site that has an equation, at times all over the recording."""
         chain, apart = scene.chain, scene.span / MOST_MIDDLES
         if not effect.texts(chain.order, chain.is_complex):
             return
-        for site in range(chain.sites):
+        for site in chain.moving:
             for at in scene.begin + apart * np.arange(1, MOST_MIDDLES):
                 yield cls(
                     effect=effect, sites=(site,), at=float(at), width=apart / 2, least=SHARP / scene.top,
