@@ -131,7 +131,7 @@ def of_coefficients(terms: Sequence[Term], order: int, units: Units) -> list[str
 
 
 def in_sentence(line: str, units: Units) -> str:
-    """Return a sentence about an effect with its offset, drift, jump or hum, or its time, in the units of the recording."""
+    """Return a sentence about an effect with its offset, drift, jump, hum or time in the units of the recording."""
     if re.search(r" angular frequency [\d.e+-]+$", line):
         line = with_unit(line, rate_of("rad", units.time))
     zero = re.fullmatch(r"((?:offset|drift|walk|hum|lag|jump) of \w+|lag from one sensor to the next): (\S+)(.*)", line)
