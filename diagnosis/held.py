@@ -62,6 +62,8 @@ def freed(samples: Samples) -> tuple[Samples, tuple[Held, ...]]:
     values, period = split_parts(samples.u, samples.is_complex).reshape(count, -1), _period(samples)
     early = _resting(values, int(np.searchsorted(t, t[0] + rules.HELD * period)))
     late = _resting(values[::-1], count - int(np.searchsorted(t, t[-1] - rules.HELD * period)))
+    if count - early - late < 2 * FEWEST:
+        return samples, ()
     if early:
         period = _period(_part(samples, early, count - late))
         early = early if _away(values[:early], values[early : np.searchsorted(t, t[early] + NEAR * period)]) else 0
@@ -100,9 +102,7 @@ def _resting(values: Float[ndarray, "time sensors"], shortest: int) -> int:
         shortest: fewer rows than this do not count.
     """
     shortest = max(shortest, FEWEST)
-    parts = (values[:shortest], values[shortest:])
-    # Sensors that are read before and after.
-    values = values[:, np.all([np.sum(np.isfinite(part), axis=0) >= FEWEST for part in parts], axis=0)]
+    values = values[:, np.all(_read(values[:shortest], values[shortest:]), axis=0)]
     if not values.size or not _still(values, shortest):
         return 0
     row = 0
@@ -122,12 +122,16 @@ def _moved(values: Float[ndarray, "time sensors"], rows: int) -> int:
 
 def _away(rest: Float[ndarray, "time sensors"], motion: Float[ndarray, "time sensors"]) -> bool:
     """Return whether a sensor reads something else at rest than in the mean of the motion."""
-    read = [np.sum(np.isfinite(part), axis=0) >= FEWEST for part in (rest, motion)]
-    rest, motion = (part[:, np.all(read, axis=0)] for part in (rest, motion))
+    rest, motion = (part[:, np.all(_read(rest, motion), axis=0)] for part in (rest, motion))
     if not rest.size:
         return False
     apart = np.abs(np.nanmean(motion, axis=0) - np.nanmedian(rest, axis=0))
     return bool(np.any(apart > np.maximum(rules.AWAY * np.nanstd(motion, axis=0), MOVES * _scatter(rest))))
+
+
+def _read(*parts: Float[ndarray, "time sensors"]) -> list[ndarray]:
+    """Return which sensors each part of a recording has enough readings of."""
+    return [np.sum(np.isfinite(part), axis=0) >= FEWEST for part in parts]
 
 
 def _still(values: Float[ndarray, "time sensors"], rows: int) -> bool:
@@ -145,7 +149,8 @@ def _scatter(values: Float[ndarray, "time sensors"]) -> Float[ndarray, " sensors
 
 def _swings(values: Float[ndarray, "time sensors"], later: Float[ndarray, "time sensors"]) -> bool:
     """Return whether the liveliest sensor passed the place where it rests later again and again."""
-    site = int(np.nanargmax(np.nanvar(values, axis=0)))
+    values, later = (part[:, np.all(_read(values, later), axis=0)] for part in (values, later))
+    site = int(np.argmax(np.nanvar(values, axis=0)))
     column = values[:, site][np.isfinite(values[:, site])]
     return int(np.sum(np.diff(np.sign(column - np.nanmedian(later[:, site]))) != 0)) >= PASSES
 

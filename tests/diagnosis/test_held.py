@@ -66,10 +66,11 @@ def test_where_several_sites_are_held_all_of_them_rest():
     [
         swing(T), swing(T, decay=0.4), 0.3 + swing(T, decay=1.5), np.exp(-T), 1 - np.exp(-T), swing(T)[::-1],
         np.where(T < 5, 0.0, np.sin(OMEGA * (T - 5))), np.cos(OMEGA * T) * np.cos(0.2 * T), 0.001 * T, 0 * T,
+        np.where(T < 12, 0.5, -0.5),
     ],
     ids=[
         "swing", "damped", "overdamped", "falls", "rises", "grows", "kicked from where it rests", "beats", "drifts",
-        "at rest",
+        "at rest", "steps",
     ],
 )  # fmt: skip
 def test_nothing_is_left_out_of_a_motion_without_a_hand(u):
@@ -91,6 +92,11 @@ def test_a_swing_that_is_stuck_is_left_out_from_where_it_stops():
     assert moving.t[-1] == held.begin
     # In between it has moved by a few times the noise at most.
     assert np.max(np.abs(u[-held.rows :] - u[-1])) < 10 * NOISE < np.max(np.abs(u[: -held.rows][-30:] - u[-1]))
+
+
+def test_a_sensor_that_reads_nothing_does_not_hide_where_a_swing_is_stuck():
+    u = rubbed(np.arange(0, 40, STEP))
+    assert len(freed(read(np.nan * u, u))[1]) == 1
 
 
 def test_missing_readings_outliers_and_steps_do_not_hide_a_hand():
