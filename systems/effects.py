@@ -21,6 +21,9 @@ HOW: dict[str, str] = {
     "harmonic at one site": "the same at one site only; omega and site found",
     "pulse": "the formula times exp(-((t - at) / width)^2 / 2), at every site alike; at and width found",
     "pulse at one site": "the same at one site only; at, width and site found",
+    "ramp": "a declared term, or the formula, times s / T, s counted from the middle, T being the recording's length; "
+    "term found",
+    "step": "a declared term, or the formula, from one time on; term and time found",
     "delayed": "the formula of the field a delay earlier; delay found",
     "long range": "sum over r >= 2 of (u_{n+r} + u_{n-r} - 2 u_n) / r^s; s found",
     "alternating": "the formula with the sign (-1)^k at site k",
@@ -195,6 +198,15 @@ CATALOGUE: tuple[Effect, ...] = (
     ),
     Effect("memory", "u[n]", acts="delayed", look_for="a residual that follows the field with a lag", source=LJUNG),
     Effect("kick", "1", acts="pulse", look_for="a residual that begins at one time, at all sites", source=NAYFEH),
+    Effect(
+        "coefficient-drift", "u[n]", acts="ramp",
+        look_for="a frequency or a loss that changes steadily, as of what warms up, whatever the size of the swings",
+        source=NAYFEH,
+    ),
+    Effect(
+        "coefficient-jump", "u[n]", acts="step", look_for="an equation that is another one from one time on",
+        source="Basseville & Nikiforov, Detection of Abrupt Changes (1993)",
+    ),
     # Coupling.
     Effect(
         "next-neighbour", "u[n+2]+u[n-2]-2*u[n]",

@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 DIGITS = 4
 # Numbers of effects that are times; what stands before a term that acts with a sign at every second site, or in time.
 TIMES = ("delay", "at", "width")
-IN_TIME = r"^(?:\(-1\)\^k|(?:cos|sin)\([^()]*\*(?:t|\(t[^()]*\))\)|exp\(-\((?:t|\(t[^()]*\))/[^()]*\)\*\*2/2\))\*?"
+SINCE = r"(?:t|\(t[^()]*\))"
+IN_TIME = (
+    rf"^(?:step of |(?:\(-1\)\^k|(?:cos|sin)\([^()]*\*{SINCE}\)|exp\(-\({SINCE}/[^()]*\)\*\*2/2\)|{SINCE}/[\d.e+-]+)"
+    r"\*?)"
+)
 
 
 class Units(Content):
@@ -131,11 +135,12 @@ def of_coefficients(terms: Sequence[Term], order: int, units: Units) -> list[str
 
 
 def in_sentence(line: str, units: Units) -> str:
-    """Return a sentence about an effect with its offset, drift, jump, hum or time in the units of the recording."""
+    """Return a sentence about an effect with its offset, drift, jump, hum or times in the units of the recording."""
     if re.search(r" angular frequency [\d.e+-]+$", line):
         line = with_unit(line, rate_of("rad", units.time))
     zero = re.fullmatch(r"((?:offset|drift|walk|hum|lag|jump) of \w+|lag from one sensor to the next): (\S+)(.*)", line)
     if zero:
         factor, unit = of_natural(zero[1], units)
-        return f"{zero[1]}: {with_unit(f'{float(zero[2]) * factor:.{DIGITS}g}', unit)}{zero[3]}"
+        line = f"{zero[1]}: {with_unit(f'{float(zero[2]) * factor:.{DIGITS}g}', unit)}{zero[3]}"
+    line = re.sub(r"((?:from|at) t = [\d.e+-]+)(?= on,|$)", lambda at: with_unit(at[0], units.time), line)
     return with_unit(line, units.time) if re.search(r" within [\d.e+-]+$", line) else line

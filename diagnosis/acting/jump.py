@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, InStep, Misreading, OfSensors, Placed, Scene
+from latticebench.diagnosis.acting.placed import (
+    DIGITS,
+    Chain,
+    Force,
+    InStep,
+    Misreading,
+    OfSensors,
+    Placed,
+    Scene,
+    since,
+)
 from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
 from latticebench.systems.effects import Effect
 
@@ -18,16 +28,16 @@ if TYPE_CHECKING:
 
 # The width of a jump between two readings, over the shortest time in which the motion changes by a radian: any smaller
 # one does the same, and time and width are known the less.
-SHARP = 0.03
+SHARP = 0.02
 
 
 @dataclass(frozen=True)
 class Rise(InStep):
-    """Phi(x) of the normal distribution, x = (t - at) / wide, or its derivative -x**power * phi(x), alike at all sites.
+    """(1 + tanh x) / 2 with x = (t - at) / wide, or its derivative -x**power / (2 cosh(x)^2), alike at all sites.
 
     Attributes:
         at, wide: in the unit of time.
-        power: of x in the derivatives by `at` and by `wide`, of which each is that over `wide`; None for Phi.
+        power: of x in the derivatives by `at` and by `wide`, of which each is that over `wide`; None for the rise.
     """
 
     at: float
@@ -36,16 +46,21 @@ class Rise(InStep):
 
     def __call__(self, t: ndarray) -> ndarray:
         """Return its values (1, B, 1)."""
-        from scipy.special import ndtr
-
         x = (t - self.at) / self.wide
-        values = ndtr(x) if self.power is None else -(x**self.power) * np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
+        rise = np.tanh(x)
+        values = (1 + rise) / 2 if self.power is None else -(x**self.power) * (1 - rise**2) / 2
         return np.asarray(values[None, :, None])
+
+    def __str__(self) -> str:
+        """Return it in the term language."""
+        x = f"({since(self.at)}/{self.wide!r})"
+        slope = f"(1-tanh({x})**2)/2"
+        return f"(1+tanh({x}))/2" if self.power is None else f"-{x}*{slope}" if self.power else f"-{slope}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Jump(OfSensors, acts="jump"):
-    """The reading is u + b * Phi((t - at) / width), Phi being the normal distribution: a sensor that was knocked.
+    """The reading is u + b (1 + tanh((t - at) / width)) / 2: a sensor that was knocked.
 
     Attributes:
         at, width: in the unit of time.

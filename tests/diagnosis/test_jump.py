@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.stats import norm
 
 from latticebench.diagnosis.acting import WAYS
 from latticebench.diagnosis.problem import Problem
@@ -53,7 +52,7 @@ def test_a_sensor_that_is_knocked_is_named_with_the_time_and_by_how_much(sites):
 
 @pytest.mark.slow
 def test_a_zero_that_moves_within_a_while_has_its_middle_and_its_width():
-    found = diagnose(DECLARED, 2, [read(2, JUMP * norm.cdf((T - WHEN) / 0.8))], (*INSTRUMENT, find("damping")))
+    found = diagnose(DECLARED, 2, [read(2, JUMP * (1 + np.tanh((T - WHEN) / 0.8)) / 2)], (*INSTRUMENT, find("damping")))
     (jump,) = (one for one in found.findings if one.name == "sensor-jump")
     for name, true in (("at", WHEN), ("width", 0.8)):
         value, error = jump.values[name]

@@ -62,7 +62,16 @@ SECOND_ORDER = (
     "other: gyroscopic-bonds",
 )
 COMPLEX = ("other: phase-conjugation", "other: nonlocal-response")
-REAL = ("damping", "bond-damping", "nonlinear-damping", "nonlinear-loss", "gain-loss", "disorder")
+REAL = (
+    "damping",
+    "bond-damping",
+    "nonlinear-damping",
+    "nonlinear-loss",
+    "gain-loss",
+    "disorder",
+    "coefficient-drift",
+    "coefficient-jump",
+)
 
 
 def _pushing(names: dict[str, Callable[[pushes.Moment], np.ndarray]]) -> dict[str, Fault]:

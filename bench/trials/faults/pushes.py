@@ -148,6 +148,10 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "gradient": lambda m: m.drawn.n * (m.u if m.chain.order == 1 else 1),
     "trap": lambda m: m.drawn.n**2 * m.u,
     "kick": lambda m: m.pulse() * np.ones(len(m.u)),
+    "coefficient-drift": lambda m: (m.t - m.drawn.about["middle"]) * (1j if m.chain.is_complex else 1) * m.u,
+    "coefficient-jump": lambda m: (
+        float(m.t > m.drawn.about["at"]) * (1j if m.chain.is_complex else 1) * (m.stretch(1) + m.stretch(-1))
+    ),
     "next-neighbour": lambda m: m.stretch(2) + m.stretch(-2),
     "quadratic-coupling": lambda m: m.stretch(1) ** 2 - m.stretch(-1) ** 2,
     "bond-damping": between,
@@ -171,13 +175,11 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
 # Outside the catalogue; those called wavy and uneven have a form that is drawn, so that no list of terms can hold it.
 PLAIN: dict[str, Callable[[Moment], ndarray]] = {
     "other: cubic-drag": lambda m: -(m.v**3),
-    "other: drifting-stiffness": lambda m: (m.t - m.drawn.about["middle"]) * m.u,
     "other: noise-force": lambda m: np.sum(np.cos(m.drawn.omegas * m.t + m.drawn.phases), axis=0),
     "other: saturation": lambda m: m.u / (1 + 4 * np.abs(m.u) ** 2) if m.chain.is_complex else np.cos(3 * m.u),
     "other: wavy-force": lambda m: m.waves(np.abs(m.u)) * (m.u if m.chain.is_complex else 1),
     "other: wavy-drag": lambda m: -m.waves(np.abs(m.v)) * m.v,
     "other: wavy-bonds": lambda m: sum(m.waves(np.abs(m.stretch(k))) * m.stretch(k) for k in (-1, 1)),
-    "other: sudden-coupling": lambda m: float(m.t > m.drawn.about["at"]) * (m.stretch(1) + m.stretch(-1)),
     "other: late-push": lambda m: float(m.t > m.drawn.about["at"]) * np.eye(len(m.u))[m.drawn.site],
 }
 

@@ -37,6 +37,9 @@ FEWEST_READINGS, MOST_READINGS, PER_PERIOD = 500, 5000, 8.0
 # period is that of -mu sign(v) to about one in a thousand.
 LAYER = 0.01
 
+# A coefficient that changes at once does so along a tanh of this width, over the fastest mode's angular frequency.
+SUDDEN = 0.1
+
 EQUATIONS: tuple[tuple[tuple[str, ...], tuple[Ends, ...], int], ...] = (
     ((COUPLING, "u[n]"), ("free", "fixed", "periodic"), 2),
     ((COUPLING, "sin(u[n])"), ("free", "fixed", "periodic"), 2),
@@ -158,8 +161,10 @@ class Chain:
             u: positions (copies, N).
             v: velocities (copies, N).
             of: parameters by name, one per copy: coefficients by the name of their force, "drive.cos", "drive.sin" and
-                "drive.omega", those of a drive at one site with "@0" at the end, and "unequal-masses@0", by which the
-                whole right-hand side of a site is scaled beyond 1.
+                "drive.omega", those of a drive at one site with "@0" at the end, "unequal-masses@0", by which the
+                whole right-hand side of a site is scaled beyond 1, "ramp of u[n]", by how much that term's coefficient
+                grows in a unit of time, it being as declared in the middle, and "step of u[n]", how much larger it is
+                from the time "step when" on, which takes `SUDDEN`.
         """
         total = np.zeros_like(u)
         masses = []
@@ -168,6 +173,11 @@ class Chain:
                 total += value * self.forces[name](u)
             elif name in self.frictions:
                 total += value * self.frictions[name](u, v)
+            elif name.startswith("ramp of "):
+                total += value * (t - self.span / 2) * self.forces[name.removeprefix("ramp of ")](u)
+            elif name.startswith("step of "):
+                share = (1 + np.tanh((t - of["step when"]) * self.fast / SUDDEN)) / 2
+                total += value * share * self.forces[name.removeprefix("step of ")](u)
             elif name.startswith("unequal-masses"):
                 masses.append((int(name.partition("@")[2]), value))
         for end in {name.removeprefix("drive.cos") for name in of if name.startswith("drive.cos")}:

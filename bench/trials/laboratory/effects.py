@@ -3,7 +3,8 @@
 Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
 "cos", "sin" and "omega" (of a drive, at all sites or at one, or of a sensor's hum), "offset_2", "gain_2", "curve_2",
 "lag_2" and "jump_2" (of the second sensor, which reads gain * u + offset + curve * u^2 - lag * v, and from the time
-"when" on jump more), "curve" and "cubic" (one for all, the latter of u^3), and "bond_2" (from the second site on).
+"when" on jump more), "curve" and "cubic" (one for all, the latter of u^3), "bond_2" (from the second site on), and
+"ramp of u[n]" (how fast that coefficient changes) and "step of u[n]" (by how much it does, at "when").
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ OWN_CURVE = "own-sensor-curve"
 HUM, PER_HALF = "sensor-hum", 1.25
 # A sensor that lags, one that is knocked, and all that see through a lens, likewise.
 LAG, JUMP, LENS = "sensor-lag", "sensor-jump", "sensor-saturation"
+# Declared coefficients that change, likewise.
+AGEING, SLIP = "coefficient-drift", "coefficient-jump"
 # Springs of which no two are alike, likewise.
 BONDS, FEWEST_BONDS = "unequal-bonds", 3
 # A hum that is at least so many times as fast as the chain, where it is read so often; put in where it is asked for.
@@ -49,7 +52,7 @@ NAMES = (
 )  # fmt: skip
 # How often each is drawn, where 1 is not given: what most recordings have.
 OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
-ASKED = (*NAMES, *LOCAL, BONDS, OWN_CURVE, HUM, LAG, JUMP, LENS, MAINS, *CLASSIC)
+ASKED = (*NAMES, *LOCAL, BONDS, OWN_CURVE, HUM, LAG, JUMP, LENS, MAINS, AGEING, SLIP, *CLASSIC)
 """Every effect that can be asked for."""
 HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
 """Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
@@ -87,6 +90,8 @@ class Ingredient:
         """Return the name of one of its parameters among all of a chain's, see `Chain.rate`."""
         if self.name in (HUM, JUMP):
             return f"{self.name.removeprefix('sensor-')}.{parameter.partition('_')[0]}@{self.site}"
+        if self.name in (AGEING, SLIP):
+            return parameter if parameter in self.direction else "step when"
         if self.name == BONDS:
             return f"{BOND}@{int(parameter.partition('_')[2]) - 1}"
         if self.name in (DRIVE, LOCAL_DRIVE):
@@ -158,6 +163,8 @@ def draw_ingredient(name: str, chain: Chain, reach: int, draw: np.random.Generat
     if name == JUMP:
         when = chain.span * draw.uniform(0.15, 0.85)
         return Ingredient(name, site, {f"jump_{site + 1}": sign * chain.size}, 1.0, {"when": float(when)})
+    if name in (AGEING, SLIP):
+        return _changing(name, chain, sign, draw)
     if name == BONDS:
         each = chain.coupling * draw.normal(size=chain.sites - 1)
         each -= np.mean(each)
@@ -236,6 +243,17 @@ def _unit(name: str, chain: Chain) -> tuple[float, float]:
         "nonlinear-coupling": (coupling / size**2, 0.3),
         "asymmetric-coupling": (coupling, 0.2),
     }[name]
+
+
+def _changing(name: str, chain: Chain, sign: float, draw: np.random.Generator) -> Ingredient:
+    """Return a declared coefficient of a force that is linear in small swings, which changes steadily or at once."""
+    linear = [k for k, text in enumerate(chain.declared) if text != DECLARED["onsite-cubic"]]
+    k = int(draw.choice(linear))
+    text, value = chain.declared[k], sign * float(chain.coefficients[k])
+    if name == AGEING:
+        return Ingredient(name, None, {f"ramp of {text}": value / chain.span}, 0.2, {})
+    when = chain.span * draw.uniform(0.15, 0.85)
+    return Ingredient(name, None, {f"step of {text}": value}, 0.2, {"when": float(when)})
 
 
 def _offset(chain: Chain, inner: ndarray, draw: np.random.Generator) -> Ingredient:

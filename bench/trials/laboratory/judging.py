@@ -39,6 +39,8 @@ POWERS = {
 }  # fmt: skip
 # The label of a wave, and minus the time since which its phase is counted.
 WAVE = r"(?:hum of u\d*, )?(cos|sin)\(.*\*(?:t|\(t([+-][^()]*)\))\)"
+# The label of a declared term whose coefficient changes steadily.
+RAMP = r"(?:t|\(t[^()]*\))/([\d.e+-]+)\*(.*)"
 # Labels of values that are no coefficient of a term, with the names that recordings have for them.
 NAMED = {"omega": "omega", "curve of u": "curve", "cubic curve of u": "cubic", "scale": "scale"}
 # Half the width of a 95 % interval, in standard errors.
@@ -83,13 +85,17 @@ def called(values: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
     found = {}
     for label, (value, error) in values.items():
         sensor, wave = re.match(r"(offset|gain|curve|lag|jump) of u(\d+)", label), re.match(WAVE, label)
+        ramp = re.fullmatch(RAMP, label)
         if sensor is not None:
             found[f"{sensor[1]}_{sensor[2]}"] = (value + (sensor[1] == "gain"), error)
+        elif ramp is not None:
+            text = ramp[2].removeprefix("(").removesuffix(")") if ramp[2].startswith("(") else ramp[2]
+            found[f"ramp of {text}"] = (value / float(ramp[1]), error / float(ramp[1]))
         elif wave is not None:
             found[wave[1]] = (value, error)
             found["middle"] = (-float(wave[2] or 0), 0.0)
         else:
-            found[NAMED.get(label, "coefficient")] = (value, error)
+            found[NAMED.get(label, label if label.startswith("step of ") else "coefficient")] = (value, error)
     return found
 
 

@@ -16,7 +16,11 @@ MIRRORED = Units(time="s", reading="mm", equation="m", scale=-0.001)
     [
         ("offset of u1: 0.02", "offset of u1: -20 mm"),
         ("drift of u3: -0.5 over the recording", "drift of u3: 500 mm over the recording"),
-        ("jump of u3: -0.5 at t = 17.2", "jump of u3: 500 mm at t = 17.2"),
+        ("jump of u3: -0.5 at t = 17.2", "jump of u3: 500 mm at t = 17.2 s"),
+        (
+            "from t = 25.1 on, the coefficient of u[n] is larger by -0.5",
+            "from t = 25.1 s on, the coefficient of u[n] is larger by -0.5",
+        ),
         # A standard deviation has no sign, whichever way the sensor counts.
         ("walk of u2: 0.5 over the recording, and so on", "walk of u2: 500 mm over the recording, and so on"),
         (
@@ -71,7 +75,8 @@ def test_a_coefficient_has_the_unit_of_the_derivative_over_that_of_its_term(
         ("sin(2.5*t)*u[n]", "1/s^2"),
         ("sin(2.5*(t+3))*u[n]", "1/s^2"), ("exp(-((t-3)/0.5)**2/2)", "mm/s^2"),
         ("exp(-((t+3.2)/0.5)**2/2)", "mm/s^2"), ("exp(-(t/0.5)**2/2)*u[n]", "1/s^2"),
-        ("omega", "rad/s"), ("delay", "s"),
+        ("step of u[n+1]+u[n-1]-2*u[n]", "1/s^2"), ("step of u[n]**3", "1/(mm^2 s^2)"), ("(t-20)/40*v[n]", "1/s"),
+        ("t/1.5e+03*(u[n+1]+u[n-1]-2*u[n])", "1/s^2"), ("omega", "rad/s"), ("delay", "s"),
         ("decay time", "s"), ("mass_ratio", ""), ("slowness of the clock", ""), ("u[n](t-0.3)", "1/s^2"),
     ],
 )  # fmt: skip

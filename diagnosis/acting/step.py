@@ -1,0 +1,92 @@
+"""A coefficient that is another one from one time on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from latticebench.diagnosis.acting.jump import Rise
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Placed, Scene
+from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
+from latticebench.diagnosis.acting.ramp import changing
+from latticebench.systems.effects import Effect
+
+# The width of a step over the shortest time in which the motion changes by a radian: what moves has no time to notice
+# whether it is less, and a sharper one asks for shorter steps of integration.
+SHARP = 0.1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Step(Placed, acts="step"):
+    """A term times strength * (1 + tanh((t - at) / width)) / 2: a spring that slips, a screw that comes loose.
+
+    Attributes:
+        text: the term.
+        at, width: in the unit of time.
+        least: the width below which it is taken as sharp, in the unit of time.
+        seen: the first and the last time of all recordings, between which it happens.
+    """
+
+    text: str
+    at: float
+    width: float
+    least: float
+    seen: tuple[float, float]
+    shape: ClassVar[tuple[str, ...]] = ("at", "width")
+    timed: ClassVar[bool] = True
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return every term whose coefficient may change, at times all over the recording."""
+        apart = scene.span / MOST_MIDDLES
+        for text in changing(effect, scene):
+            for at in scene.begin + apart * np.arange(1, MOST_MIDDLES):
+                yield cls(
+                    effect=effect, text=text, at=float(at), width=apart / 2, least=SHARP / scene.top, seen=scene.seen,
+                    strength=(0.0,),
+                )  # fmt: skip
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect and its term."""
+        return (self.effect.name, self.text)
+
+    @property
+    def near(self) -> tuple[object, ...]:
+        """The effect, its term and its time, to a width."""
+        return (*self.place, f"{self.at / self._wide:.0f}")
+
+    @property
+    def possible(self) -> bool:
+        """Whether it happens between the first and the last time: before and after it is another coefficient."""
+        return self.seen[0] < self.at < self.seen[1]
+
+    def begun(self, t: float) -> bool:
+        """Return whether it happens before a time."""
+        return self.at <= t
+
+    @property
+    def _wide(self) -> float:
+        return float(np.hypot(self.width, self.least))
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
+        """Return the term with its factor."""
+        return (f"step of {self.text}",)
+
+    def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
+        """Return the step and, for time and width, its derivatives by them."""
+        wide, value = self._wide, self.strength[0]
+        found = [Force(self.text, value, {0: 1.0}, None, Rise(self.at, wide))]
+        if value:
+            by_width = value * self.width / wide**2
+            found.append(Force(self.text, 0.0, {1: value / wide}, None, Rise(self.at, wide, 0)))
+            found.append(Force(self.text, 0.0, {2: by_width}, None, Rise(self.at, wide, 1)))
+        return found
+
+    def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
+        """Return by how much the coefficient changes, and when."""
+        more = f"{self.strength[0]:.{DIGITS}g}"
+        return [f"from t = {self.at:.{DIGITS}g} on, the coefficient of {self.text} is larger by {more}"]
