@@ -155,9 +155,7 @@ def _beside(samples: Samples, fit: Fit, number: int) -> Overlay:
 
 def _first(samples: Samples) -> Samples:
     """Return the rows of a recording that are shown."""
-    rows = max(FEWEST_ROWS, MOST_NUMBERS // (samples.sites * (1 + samples.is_complex)))
-    v, f = (None if one is None else one[:rows] for one in (samples.v, samples.f))
-    return replace(samples, t=samples.t[:rows], u=samples.u[:rows], v=v, f=f)
+    return samples.of_rows(slice(max(FEWEST_ROWS, MOST_NUMBERS // (samples.sites * (1 + samples.is_complex)))))
 
 
 def motion_of(samples: Samples, fit: Fit, number: int) -> Float[ndarray, "time order parts sites"]:

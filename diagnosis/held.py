@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,14 +65,14 @@ def freed(samples: Samples) -> tuple[Samples, tuple[Held, ...]]:
     if count - early - late < 2 * FEWEST:
         return samples, ()
     if early:
-        period = _period(_part(samples, early, count - late))
+        period = _period(samples.of_rows(slice(early, count - late)))
         early = early if _away(values[:early], values[early : np.searchsorted(t, t[early] + NEAR * period)]) else 0
     if late:
         end = count - late
-        period = _period(_part(samples, early, end))
+        period = _period(samples.of_rows(slice(early, end)))
         near = values[np.searchsorted(t, t[end - 1] - NEAR * period) : end]
         late = late if _away(values[end:], near) and _swings(values[early:end], values[end:]) else 0
-    moving = _part(samples, early, count - late)
+    moving = samples.of_rows(slice(early, count - late))
     if not (early or late) or np.ptp(moving.t) < NEAR * _period(moving):
         return samples, ()
     found = []
@@ -81,11 +81,6 @@ def freed(samples: Samples) -> tuple[Samples, tuple[Held, ...]]:
     if late:
         found.append(Held(samples.source, float(t[count - late - 1]), float(t[-1]), late, early=False))
     return moving, tuple(found)
-
-
-def _part(samples: Samples, begin: int, end: int) -> Samples:
-    v, f = (None if field is None else field[begin:end] for field in (samples.v, samples.f))
-    return replace(samples, t=samples.t[begin:end], u=samples.u[begin:end], v=v, f=f)
 
 
 def _period(samples: Samples) -> float:

@@ -163,8 +163,7 @@ class Problem:
         cuts = [max(DEGREE + 1, round(len(one.t) * share)) for one in self.data]
         data, records, nodes = [], [], []
         for cut, one, record, states in zip(cuts, self.data, self.records, self.nodes, strict=True):
-            v, f = (None if field is None else field[:cut] for field in (one.v, one.f))
-            data.append(replace(one, t=one.t[:cut], u=one.u[:cut], v=v, f=f))
+            data.append(one.of_rows(slice(cut)))
             records.append(replace(record, value=record.value[:cut], seen=record.seen[:cut], times=record.times[:cut]))
             nodes.append(states[:cut])
         return replace(self, data=tuple(data), records=tuple(records), nodes=tuple(nodes))
@@ -301,9 +300,7 @@ def thinned(samples: Samples, top: float, fast: Float[ndarray, " lines"]) -> Sam
     strides = range(stride, 0, -1) if samples.f is None else [1 << k for k in range(stride.bit_length() - 1, -1, -1)]
     step, near = mean_step(samples.t), rules.AROUND * np.pi / float(samples.t[-1] - samples.t[0])
     stride = min(strides, key=lambda k: hidden(fast, k * step, FARTHER * top, near)) if len(fast) else strides[0]
-    f = None if samples.f is None else samples.f[::stride]
-    u, v = samples.u[::stride], None if samples.v is None else samples.v[::stride]
-    return replace(samples, t=samples.t[::stride], u=u, v=v, f=f)
+    return samples.of_rows(slice(None, None, stride))
 
 
 def around(part: Samples, whole: Samples) -> Samples | None:
@@ -311,9 +308,8 @@ def around(part: Samples, whole: Samples) -> Samples | None:
     if whole.f is None:
         return None
     begin, end = np.searchsorted(whole.t, part.t[[0, -1]])
-    rows = slice(max(begin - MARGIN, 0), end + 1 + MARGIN)
-    v = None if whole.v is None else whole.v[rows]
-    return replace(whole, t=whole.t[rows], u=np.zeros_like(whole.u[rows]), v=v, f=whole.f[rows])
+    near = whole.of_rows(slice(max(begin - MARGIN, 0), end + 1 + MARGIN))
+    return replace(near, u=np.zeros_like(near.u))
 
 
 def windows(samples: Samples) -> list[Samples]:
@@ -331,12 +327,7 @@ def windows(samples: Samples) -> list[Samples]:
     least = np.arange(WINDOWS) * size
     begins = least + np.maximum.accumulate(np.maximum(middles - size // 2 - least, 0))
     begins = np.minimum(begins, count - size * np.arange(WINDOWS, 0, -1))
-    found = []
-    for begin in begins:
-        rows = slice(begin, begin + size)
-        v, f = (None if one is None else one[rows] for one in (samples.v, samples.f))
-        found.append(replace(samples, t=samples.t[rows], u=samples.u[rows], v=v, f=f))
-    return found
+    return [samples.of_rows(slice(begin, begin + size)) for begin in begins]
 
 
 def _states(samples: Samples, order: int) -> tuple[ndarray, ndarray | None]:

@@ -24,7 +24,7 @@ from latticebench.labelled import as_table, is_labelled
 from latticebench.pictures import Film, Picture, Survey
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.lattice import Library, library
-from latticebench.systems.layout import Layout
+from latticebench.systems.layout import ALWAYS, Layout
 from latticebench.systems.options import called_from_python
 from latticebench.systems.readers import from_arrays, from_frame, read_all
 from latticebench.systems.samples import Samples, check_alike, check_units
@@ -136,6 +136,7 @@ def read(
     sort: bool = False,
     turn: float = 0.0,
     time_scale: str | float = 1.0,
+    between: tuple[float, float] = ALWAYS,
 ) -> Recording:
     """Read a recording.
 
@@ -153,6 +154,7 @@ def read(
             neighbouring readings must be less than half of it apart. 0 leaves u as it is. v is never changed.
         time_scale: what one unit of the times is in the equation: a number, or the unit of the times such as "ms",
             which become seconds. v, the change of u in one unit of the times, is divided by it.
+        between: the first and the last time that are read, in the unit of the file.
 
     Raises:
         InputError: it cannot be read; the message says where, and what would read it.
@@ -176,7 +178,7 @@ def read(
     chosen = (columns,) if isinstance(columns, str) else tuple(columns)
     if time is not None and not isinstance(time, str):
         source, time = _with_times(source, time), None
-    layout = Layout(time, chosen, str(scale), sort, turn, str(time_scale))
+    layout = Layout(time, chosen, str(scale), sort, turn, str(time_scale), between)
     if is_labelled(source):
         table, layout = as_table(source, layout)
         return Recording(tuple(from_frame(table, type(source).__name__, "unknown", layout)))

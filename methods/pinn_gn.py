@@ -161,10 +161,7 @@ class PINNGaussNewton:
             return [samples]
         count = min(math.ceil(self._asked(samples, frequency) / MOST_AT_START), max(1, len(samples.t) // 8))
         return [
-            replace(
-                samples, t=samples.t[some], u=samples.u[some], v=None if samples.v is None else samples.v[some],
-                f=None if samples.f is None else samples.f[some],
-            )
+            samples.of_rows(slice(some[0], some[-1] + 1))
             for some in np.array_split(np.arange(len(samples.t)), count)
         ]  # fmt: skip
 

@@ -32,6 +32,8 @@ STANDARD = re.compile(r"t|f|trajectory|(u|v|f|re|im)[1-9]\d{0,5}")
 NUMERIC = re.compile(r"[+-]?\d*[.,]?\d+([eE][+-]?\d+)?")
 # A name that was meant to be one of the standard ones, so that leaving it out would be wrong.
 NEARLY = re.compile(r"t|(u|v|f|re|im) ?_?\d*", re.IGNORECASE)
+# Every time.
+ALWAYS = (-math.inf, math.inf)
 # Names that are written out in a message.
 LISTED = 12
 
@@ -51,6 +53,8 @@ class Layout:
             neighbouring readings must be less than half of it apart. 0 leaves u as it is. v is never changed.
         time_scale: what one unit of the times is in the equation: a number, or the unit of the times, such as "ms",
             which become seconds. v, the change of u in one unit of the times, is divided by it.
+        between: the first and the last time that are read, in the unit of the file; dates become seconds after the
+            first row.
     """
 
     time: str | None = None
@@ -59,6 +63,19 @@ class Layout:
     sort: bool = False
     turn: float = 0.0
     time_scale: str = "1"
+    between: tuple[float, float] = ALWAYS
+
+    @property
+    def stretch(self) -> tuple[float, float]:
+        """The first and the last time that are read, in the unit of the file.
+
+        Raises:
+            InputError: they are no two times, one after the other.
+        """
+        first, last = self.between
+        if not first < last:
+            raise InputError(f"{option('between', self.between)}: give a time and a later one; inf for the last")
+        return first, last
 
     @property
     def period(self) -> float:

@@ -32,17 +32,21 @@ def called_from_python(function: Callable[P, R]) -> Callable[P, R]:
     return spoken
 
 
-def option(name: str, value: str | float | bool | None = None) -> str:
+def option(name: str, value: str | float | bool | tuple[float, ...] | None = None) -> str:
     """Return an option as it is given, with its value if one is known; True is that of a switch.
 
     >>> option("time-scale", "ms"), option("sort", True), option("columns", "theta_*")
     ('--time-scale ms', '--sort', '--columns "theta_*"')
+    >>> option("between", (2.5, 40.0))
+    '--between 2.5 40'
     """
     if _IN_PYTHON.get():
         argument = name.replace("-", "_")
         return argument if value is None else f"{argument}={_plain(value)}"
     if value is None or value is True:
         return f"--{name}"
+    if isinstance(value, tuple):
+        return f"--{name} {' '.join(map(_plain, value))}"
     text = value if isinstance(value, str) else f"{value:.16g}"
     return f"--{name} {text}" if re.fullmatch(r"[\w.,+-]+", text) else f'--{name} "{text}"'
 
@@ -74,5 +78,7 @@ def setting(name: str, value: str) -> str:
     return f"{name}={value!r}" if _IN_PYTHON.get() else f"--set {name}={value}"
 
 
-def _plain(value: str | float | bool) -> str:
+def _plain(value: str | float | bool | tuple[float, ...]) -> str:
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_plain, value))})"
     return f"{value:.16g}" if isinstance(value, float) else repr(value)

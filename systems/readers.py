@@ -24,7 +24,7 @@ from latticebench.systems.folders import ZARR, files_in, partition, zarr_arrays
 from latticebench.systems.layout import UNITS, Layout, choose, quoted
 from latticebench.systems.npz import ARRAYS, check_names, read_npz
 from latticebench.systems.options import option
-from latticebench.systems.ordering import averaged, in_order, unwrapped
+from latticebench.systems.ordering import averaged, in_order, unwrapped, within
 from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 from latticebench.systems.tables import DASHES, Table, check_count, named_once, read_csv, read_sheet
@@ -169,6 +169,8 @@ def _samples(arrays: Arrays, told: _Told) -> Samples:
     if told.layout.sort:
         arrays, notes = averaged(arrays)
         origin = origin.noting(*notes)
+    arrays, notes = within(arrays, told.layout.stretch, told.source)
+    origin = origin.noting(*notes)
     t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
     assert t is not None
     assert u is not None

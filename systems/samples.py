@@ -210,6 +210,11 @@ class Samples:
         )
         return curve
 
+    def of_rows(self, rows: slice) -> Samples:
+        """Return the samples at some of the times."""
+        v, f = (None if field is None else field[rows] for field in (self.v, self.f))
+        return replace(self, t=self.t[rows], u=self.u[rows], v=v, f=f)
+
     def mirrored(self) -> Samples:
         """Return the samples of -u, which solves an equation of odd terms, too."""
         return replace(self, u=-self.u, v=None if self.v is None else -self.v, f=None if self.f is None else -self.f)
@@ -230,6 +235,13 @@ class SimulatedSamples(Samples):
     exact: Samples | None = None
     rate: Float[ndarray, "time sites"] | None = None
     noise: float = 0.0
+
+    def of_rows(self, rows: slice) -> SimulatedSamples:
+        """Return the samples at some of the times with their truth."""
+        part = super().of_rows(rows)
+        assert isinstance(part, SimulatedSamples)
+        exact, rate = self.exact, self.rate
+        return replace(part, exact=exact and exact.of_rows(rows), rate=None if rate is None else rate[rows])
 
     def mirrored(self) -> SimulatedSamples:
         """Return the samples of -u with their truth.

@@ -337,6 +337,7 @@ WRONG_CALLS = {
     "a column twice": lambda: lb.read(pd.DataFrame({"t": TIMES, "a": TIMES}), columns=["a", "a"]),
     "no scale": lambda: lb.read(TIMES, time=TIMES, scale="furlong"),
     "no time scale": lambda: lb.read(TIMES, time=TIMES, time_scale="moon"),
+    "no stretch": lambda: lb.read(TIMES, time=TIMES, between=(2, 1)),
     "no turn": lambda: lb.read(TIMES, time=TIMES, turn=-1),
     "unsorted": lambda: lb.read(TIMES, time=TIMES[::-1]),
     "no noise": lambda: lb.simulate("phi4", noise="x"),

@@ -12,8 +12,20 @@ import typer
 
 from latticebench.bench.cli.arguments import asked, kept
 from latticebench.bench.cli.options import AnyEnds, HtmlOut, JsonOut, Order, check_places, complete_systems
-from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
+from latticebench.bench.cli.reading import (
+    Between,
+    Columns,
+    Files,
+    Scale,
+    Sort,
+    Time,
+    TimeScale,
+    Turn,
+    layout_of,
+    read_told,
+)
 from latticebench.systems.errors import InputError
+from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.report.content import Report
@@ -62,6 +74,7 @@ def diagnose(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
+    between: Between = ALWAYS,
     json_out: JsonOut = None,
     html_out: HtmlOut = None,
 ) -> None:
@@ -72,7 +85,7 @@ def diagnose(
     from latticebench.systems.readers import read_all
 
     check_places([*files, *(holdout or ()), effects, system], json=json_out, html=html_out)
-    layout = layout_of(time, columns, scale, sort, turn, time_scale)
+    layout = layout_of(time, columns, scale, sort, turn, time_scale, between)
     known, declared, order = _declared(system, terms, order)
     ends = ends or ("unknown" if known is None else known.ends)
     data = read_told(files, ends, layout)

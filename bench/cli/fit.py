@@ -24,8 +24,20 @@ from latticebench.bench.cli.options import (
     TimeLimit,
     check_places,
 )
-from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
+from latticebench.bench.cli.reading import (
+    Between,
+    Columns,
+    Files,
+    Scale,
+    Sort,
+    Time,
+    TimeScale,
+    Turn,
+    layout_of,
+    read_told,
+)
 from latticebench.systems.errors import InputError
+from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.adequacy import Adequacy
@@ -61,6 +73,7 @@ def fit(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
+    between: Between = ALWAYS,
     json_out: JsonOut = None,
     html_out: HtmlOut = None,
 ) -> None:
@@ -78,7 +91,7 @@ def fit(
 
     method = methods.DEFAULT if method is None else method
     check_places([*files, system, method], json=json_out, html=html_out)
-    layout = layout_of(time, columns, scale, sort, turn, time_scale)
+    layout = layout_of(time, columns, scale, sort, turn, time_scale, between)
     own = code_file(method)
     chosen = None if own is not None else make(methods.find(method), pairs(given), texts=True)
     if own is not None:

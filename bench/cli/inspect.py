@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from latticebench.bench.cli.options import JsonOut, Order, SystemOption, Terms, check_places, place
-from latticebench.bench.cli.reading import Columns, Files, Scale, Sort, Time, TimeScale, Turn, layout_of
+from latticebench.bench.cli.reading import (
+    Between,
+    Columns,
+    Files,
+    Scale,
+    Sort,
+    Time,
+    TimeScale,
+    Turn,
+    layout_of,
+)
+from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.inspection import Inspection
@@ -33,6 +44,7 @@ def inspect(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
+    between: Between = ALWAYS,
     json_out: JsonOut = None,
     out: Annotated[
         Path | None,
@@ -56,7 +68,7 @@ def inspect(
     if out is not None and out.suffix.lower() not in PICTURES:
         raise unknown("ending", out.suffix, PICTURES, f"--out {out}")
     declared = _terms(system, terms, order)
-    data = read_all(files, "unknown", layout_of(time, columns, scale, sort, turn, time_scale))
+    data = read_all(files, "unknown", layout_of(time, columns, scale, sort, turn, time_scale, between))
     found = [look(one, declared) for one in data]
     failures: list[str] = []
     if json_out is not None:

@@ -23,8 +23,19 @@ from latticebench.bench.cli.options import (
     place,
 )
 from latticebench.bench.cli.options import Library as LibraryName
-from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
+from latticebench.bench.cli.reading import (
+    Between,
+    Columns,
+    Scale,
+    Sort,
+    Time,
+    TimeScale,
+    Turn,
+    layout_of,
+    read_told,
+)
 from latticebench.systems.errors import InputError
+from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.bounds import BoundOf
@@ -76,6 +87,7 @@ def limit(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
+    between: Between = ALWAYS,
     json_out: JsonOut = None,
     yes: Yes = False,
 ) -> None:
@@ -91,7 +103,7 @@ def limit(
         "trajectories": trajectories, "velocities": velocities, "initial": initial,
     }  # fmt: skip
     described = {name: value for name, value in simulated.items() if value is not None}
-    layout = layout_of(time, columns, scale, sort, turn, time_scale)
+    layout = layout_of(time, columns, scale, sort, turn, time_scale, between)
     if files:
         for name in described:
             raise InputError(f"--{name}: files are given, whose samples are as they are; leave it out, or the files")

@@ -9,13 +9,23 @@ import typer
 
 from latticebench.bench.cli.arguments import kept
 from latticebench.bench.cli.options import check_places, place
-from latticebench.bench.cli.reading import Columns, Scale, Sort, Time, TimeScale, Turn, layout_of, read_told
+from latticebench.bench.cli.reading import (
+    Between,
+    Columns,
+    Scale,
+    Sort,
+    Time,
+    TimeScale,
+    Turn,
+    layout_of,
+    read_told,
+)
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import shown
 
 if TYPE_CHECKING:
     from latticebench.bench.overlay import Overlay
-    from latticebench.systems.layout import Layout
+    from latticebench.systems.layout import ALWAYS, Layout
 
 EPILOG = (
     "Examples:  latticebench plot phi4.csv --out phi4.png --animate phi4.gif\n\n"
@@ -44,6 +54,7 @@ def plot(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
+    between: Between = ALWAYS,
 ) -> None:
     """Draw a recording, or a fit or a diagnosis on top of its readings: maps, lines, residual, spectra, portraits."""
     from latticebench.bench.animation import FILMS, check_film
@@ -63,7 +74,7 @@ def plot(
     if animate is not None:
         check_film(animate)
     check_places([file], out=out, animate=animate)
-    overlay = _overlay(file, trajectory, layout_of(time, columns, scale, sort, turn, time_scale))
+    overlay = _overlay(file, trajectory, layout_of(time, columns, scale, sort, turn, time_scale, between))
     for name in only or ():
         if name not in panels(overlay):
             raise unknown("panel", name, panels(overlay), "--only")

@@ -11,6 +11,7 @@ import typer
 
 from latticebench.bench.cli.options import AnyEnds, named, place
 from latticebench.systems.errors import printable
+from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.systems.layout import Layout
@@ -67,6 +68,14 @@ TimeScale = Annotated[
         "v is divided by it.",
     ),
 ]  # fmt: skip
+Between = Annotated[
+    tuple[float, float],
+    typer.Option(
+        "--between", metavar="TIME TIME", rich_help_panel=PANEL, show_default=False,
+        help="Read no other times than these, in the unit of the file; inf for the last one leaves out the beginning "
+        "alone.",
+    ),
+]  # fmt: skip
 
 
 def layout_of(
@@ -76,16 +85,17 @@ def layout_of(
     sort: bool = False,
     turn: float = 0.0,
     time_scale: str = "1",
+    between: tuple[float, float] = ALWAYS,
 ) -> Layout:
     """Return the layout that the options describe.
 
     Raises:
-        InputError: a scale is neither a number nor a unit, or the turn is none.
+        InputError: a scale is neither a number nor a unit, the turn is none, or no time is to be read.
     """
     from latticebench.systems.layout import Layout
 
-    layout = Layout(time, tuple(columns or ()), scale, sort, turn, time_scale)
-    _ = layout.factor, layout.period, layout.time_factor
+    layout = Layout(time, tuple(columns or ()), scale, sort, turn, time_scale, between)
+    _ = layout.factor, layout.period, layout.time_factor, layout.stretch
     return layout
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import pydantic
@@ -83,6 +82,4 @@ class Measured(Case):
         """Return the rows of samples that are asked for."""
         if self.rows is None:
             return samples
-        rows = slice(*self.rows)
-        v, f = (None if one is None else one[rows] for one in (samples.v, samples.f))
-        return replace(samples, t=samples.t[rows], u=samples.u[rows], v=v, f=f)
+        return samples.of_rows(slice(*self.rows))

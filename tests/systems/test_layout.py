@@ -221,6 +221,26 @@ def test_times_that_do_not_increase_are_refused_with_the_option_that_sorts_them(
         read(written(tmp_path, "t,u1\n0,1\n0,2\n1,2\n"))
 
 
+@pytest.mark.parametrize(
+    ("between", "times", "said"),
+    [
+        ((1, 3), [1, 2, 3], "rows before 1 or after 3 are not read: 2 of 5"),
+        ((1.5, np.inf), [2, 3, 4], "rows before 1.5 are not read: 2 of 5"),
+        ((-np.inf, 3.5), [0, 1, 2, 3], "rows after 3.5 are not read: 1 of 5"),
+        ((-1, 9), [0, 1, 2, 3, 4], None),
+    ],
+)
+def test_times_beyond_the_stretch_that_is_asked_for_are_left_out_in_the_unit_of_the_file(
+    tmp_path, between, times, said
+):
+    path = written(tmp_path, "t,u1,v1\n" + "".join(f"{t},{t**2},{2 * t}\n" for t in range(5)))
+    (one,) = read(path, layout=Layout(between=between, time_scale="ms"))
+    np.testing.assert_allclose(one.t, 1e-3 * np.array(times))
+    np.testing.assert_allclose(one.u[:, 0], np.square(times))
+    np.testing.assert_allclose(one.v[:, 0], 2e3 * np.array(times))
+    assert [note for note in one.origin.notes if note.startswith("rows")] == ([said] if said else [])
+
+
 def test_an_average_leaves_missing_values_out(tmp_path):
     path = written(tmp_path, "t,u1,u2\n0,1,\n0,,\n1,2,3\n")
     (one,) = read(path, layout=Layout(sort=True))
@@ -270,6 +290,8 @@ def test_additional_columns_are_left_out_and_named(tmp_path):
         (Layout("time_s", ("theta_*_deg",), time_scale="ms"), ["--time-scale ms", "column time_s", "in s"]),
         (Layout("time_s", ("theta_*_deg",), time_scale="fortnight"), ["--time-scale", "'fortnight'"]),
         (Layout("time_s", ("theta_*_deg",), time_scale="-1"), ["--time-scale", "'-1'", "above 0"]),
+        (Layout("time_s", ("theta_*_deg",), between=(3, 2)), ["--between 3 2", "a later one"]),
+        (Layout("time_s", ("theta_*_deg",), between=(50, np.inf)), ["--between 50 inf", "0 row(s)", "at least 2"]),
         (Layout("time_s"), ["u1..uN", '--columns "theta_*_deg"']),
     ],
     ids=str,

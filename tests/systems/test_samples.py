@@ -61,6 +61,19 @@ def test_mirroring_twice_gives_the_samples_back():
         np.testing.assert_array_equal(getattr(once.mirrored(), name), getattr(one, name))
 
 
+def test_rows_of_samples_have_what_was_observed_then_and_their_truth():
+    draw = np.random.default_rng(0)
+    u, v, f = draw.normal(size=(3, 3, 2))
+    part = Samples(T, u, v, f).of_rows(slice(1, None))
+    for name, whole in (("t", T), ("u", u), ("v", v), ("f", f)):
+        np.testing.assert_array_equal(getattr(part, name), whole[1:])
+    assert Samples(T, u).of_rows(slice(0, None, 2)).v is None
+    simulated = SimulatedSamples(T, u, equation="u[n]", exact=Samples(T, 2 * u), rate=3 * u).of_rows(slice(1, None))
+    np.testing.assert_array_equal(simulated.exact.u, 2 * u[1:])
+    np.testing.assert_array_equal(simulated.rate, 3 * u[1:])
+    assert SimulatedSamples(T, u).of_rows(slice(2)).rate is None
+
+
 def test_simulated_samples_derive_their_truth_and_observed_ones_have_none():
     one = SimulatedSamples(T, U, sigma=0.3, equation="2*u[n+1]-u[n]**3", exact=Samples(T, U), rate=2 * U, noise=0.1)
     np.testing.assert_allclose(one.truth(library("own", "u[n]; u[n+1]; u[n]**3")), [0, 2, -1])
