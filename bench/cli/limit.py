@@ -58,13 +58,14 @@ Ends = Annotated[
         help="How the chain ends, as far as the fit knows: the system's own, with files unknown, if not given."
     ),
 ]
+Recorded = Annotated[
+    list[Path] | None,
+    typer.Argument(parser=place, help="Recorded samples; without any, samples of --system are taken."),
+]
 
 
 def limit(
-    files: Annotated[
-        list[Path] | None,
-        typer.Argument(parser=place, help="Recorded samples; without any, samples of --system are taken."),
-    ] = None,
+    files: Recorded = None,
     system: System = None,
     library: LibraryName = None,
     terms: Terms = None,

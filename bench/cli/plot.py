@@ -22,10 +22,11 @@ from latticebench.bench.cli.reading import (
 )
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import shown
+from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.overlay import Overlay
-    from latticebench.systems.layout import ALWAYS, Layout
+    from latticebench.systems.layout import Layout
 
 EPILOG = (
     "Examples:  latticebench plot phi4.csv --out phi4.png --animate phi4.gif\n\n"
