@@ -421,7 +421,11 @@ class Search:
         return self.refit(model, fitted.layout, near, fitted, CHANGED, hope)
 
     def climbed(self, model: Model, fitted: Fitted, hope: float) -> Fitted | None:
-        """Return the fit of a model from short pieces up to those of another fit; None where the way ends before."""
+        """Return the fit of a model from short pieces up to those of another fit; None where the way ends before.
+
+        On shorter pieces, which have more starts of their own, it costs less: where that is above `hope` already, the
+        way ends.
+        """
         found = None
         for length in self.lengths[1:-1:CLIMBING]:
             layout = self.layout(length)
@@ -432,7 +436,7 @@ class Search:
                 found = self.refit(model, ready, near, fitted, FIRST)
             else:
                 found = self.carry(found, layout)
-            if found is None:
+            if found is None or found.cost > hope:
                 return None
         return None if found is None else self.carry(found, fitted.layout, hope=hope)
 
