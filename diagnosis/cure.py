@@ -104,12 +104,17 @@ def _when(factor: object) -> str:
     return "" if factor is None else str(factor)
 
 
-def corrected(model: Model, samples: Samples) -> Samples:
+def corrected(model: Model, samples: Samples, recording: int = 0) -> Samples:
     """Return a recording as instruments without the model's faults would have read it; what is missing stays so.
 
     A zero that wanders is no number, and stays; so does a lag where no velocities were read.
+
+    Args:
+        model: whose instruments are undone.
+        samples: the recording.
+        recording: its number among those that the model was fitted to.
     """
-    faults = [placed for placed in model.effects if placed.instrument and placed.quickened() is None]
+    faults = [placed for placed, _ in model.instruments(recording) if placed.quickened() is None]
     if not faults:
         return samples
     both = samples.v is not None and model.order == 2

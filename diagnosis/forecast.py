@@ -112,7 +112,7 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
     if held_out:
         other = Problem.of(problem.declared, problem.order, held_out, ()).interpolated(problem.degree)
         share, steps = HELD_OUT, 0
-        model = fitted.model
+        model = fitted.model.of_others(len(problem.data))
     else:
         other, share, steps = problem, 1 - HELD_OUT, STEPS
         model = _foreseeable(fitted.model, [one.t[round(len(one.t) * share)] for one in problem.data])
@@ -186,7 +186,7 @@ def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Predi
         whole = problem.plain.whole(np.stack(found), record.stretches.driven(late, problem.splines[number]))
         field = whole[:, : problem.chain.levels]
         predicted = field[:, 0].copy()
-        for placed, _ in model.instruments():
+        for placed, _ in model.instruments(number):
             predicted += placed.misread(late, whole).added[:, 0]
         # Nothing is likelier of a zero that wanders than that it stays where it is.
         predicted += again.zeros(number)[0]

@@ -423,7 +423,7 @@ def _readings(
         t, field = fields(layout, number, nodes[number], splines[number])
         level = field[:, : layout.chain.levels]
         own, rate = np.ones_like(level), np.zeros_like(field[:, 0])
-        for placed, _ in model.instruments():
+        for placed, _ in model.instruments(number):
             wrong = placed.misread(t, field).read(layout.chain.levels)
             level, own = level + wrong.added, own + wrong.slope
             rate = rate if wrong.by_rate is None else rate + wrong.by_rate
@@ -454,7 +454,7 @@ def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
             border.add_readings(by[..., size : size + border.size], times, layout.plain.border)
         by = as_read(by, by_field, path.own[some], None if path.by_rate is None else path.by_rate[some])
         begin += rows.size
-        for placed, block in path.model.instruments():
+        for placed, block in path.model.instruments(number):
             wrong = np.moveaxis(placed.misread(t, field).read(layout.chain.levels).by, 0, -1)
             own = count - len(path.model.numbers)
             by[..., own + block.start : own + block.stop] += wrong.reshape(rows.size, by.shape[1], -1)

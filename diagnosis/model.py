@@ -126,9 +126,15 @@ class Model:
         """Return the model without the effect of this number."""
         return replace(self, effects=self.effects[:number] + self.effects[number + 1 :])
 
-    def instruments(self) -> list[tuple[Placed, slice]]:
-        """Return the effects that act on readings, with their numbers."""
-        return [pair for pair in zip(self.effects, self.blocks, strict=True) if pair[0].instrument]
+    def instruments(self, recording: int) -> list[tuple[Placed, slice]]:
+        """Return the effects that act on the readings of a recording, with their numbers."""
+        pairs = zip(self.effects, self.blocks, strict=True)
+        return [(one, block) for one, block in pairs if one.instrument and one.acts_in(recording)]
+
+    def of_others(self, recordings: int) -> Model:
+        """Return the model without what acts in some of so many recordings alone: what may be said of others."""
+        every = range(recordings)
+        return replace(self, effects=tuple(one for one in self.effects if all(one.acts_in(k) for k in every)))
 
     def assembled(self, plain: Dynamics, chain: Chain, recording: int = 0) -> Assembled:
         """Return the right-hand side.

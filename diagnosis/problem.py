@@ -50,6 +50,8 @@ LONGEST_GAP = 1000.0
 # Dry friction is viscous at first below this share of the usual speed: a fit that is far from the motion needs forces
 # without jumps.
 AT_REST = 0.1
+# Of more recordings it is not asked whether each has zeros and units of its own.
+SEVERAL = 20
 # So many sensors are looked at for steps before it is taken that there are none.
 FEW_SENSORS = 4
 
@@ -142,6 +144,8 @@ class Problem:
             past,
             declared.texts,
             first.f is not None,
+            # Of windows of one recording, none has a zero of its own.
+            tuple(range(count)) if len(parts) == (count := len(free)) and 1 < count <= SEVERAL else (),
         )
         candidates = tuple(one for effect in catalogue for one in way_of(effect).places(effect, scene))
         nodes = tuple(plain.pack(*both) for both in states)

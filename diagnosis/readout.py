@@ -27,7 +27,7 @@ def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "tim
         number: of the recording.
         nodes: smoothed readings as states, at all its times.
     """
-    if not model.instruments():
+    if not model.instruments(number):
         return nodes
     record, chain = layout.records[number], layout.chain
     t, driven = record.times, record.stretches.driven(record.times, layout.splines[number])
@@ -35,7 +35,7 @@ def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "tim
     field = reading.copy()
     for _ in range(UNREAD):
         level, own = field[:, : chain.levels], np.ones_like(field[:, : chain.levels])
-        for placed, _ in model.instruments():
+        for placed, _ in model.instruments(number):
             wrong = placed.misread(t, field).read(chain.levels)
             level, own = level + wrong.added, own + wrong.slope
         own = np.where(np.abs(own) > LEAST_SLOPE, own, 1.0)

@@ -318,6 +318,7 @@ class Tangent:
         for one in batch:
             if one.instrument:
                 by = one.misread(along.t, along.field).read(chain.levels).by
+                by = by if one.acts_in(number) else np.zeros_like(by)
                 blocks.append(np.moveaxis(by.reshape(len(by), rows.size, -1), 0, -1))
         return np.concatenate(blocks, axis=-1)
 

@@ -128,7 +128,7 @@ class Cause(Exhibit):
         A sensor that always reads the same has no readings in it.
         """
         model, dead = self.result.after.model, self.result.dead
-        return Recording(tuple(corrected(model, without(one, dead)) for one in self.recording.samples))
+        return Recording(tuple(corrected(model, without(one, dead), k) for k, one in enumerate(self.recording.samples)))
 
     @property
     def elsewhere(self) -> tuple[str, ...]:

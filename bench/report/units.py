@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 DIGITS = 4
 # Numbers of effects that are times; what stands before a term that acts with a sign at every second site, or in time.
 TIMES = ("delay", "at", "width")
+ZERO = r"(?:offset|drift|walk|hum|lag|jump) of \w+(?: in recording \d+ beyond others)?"
 SINCE = r"(?:t|\(t[^()]*\))"
 IN_TIME = (
     rf"^(?:step of |(?:\(-1\)\^k|(?:cos|sin)\([^()]*\*{SINCE}\)|exp\(-\({SINCE}/[^()]*\)\*\*2/2\)|{SINCE}/[\d.e+-]+)"
@@ -138,7 +139,7 @@ def in_sentence(line: str, units: Units) -> str:
     """Return a sentence about an effect with its offset, drift, jump, hum or times in the units of the recording."""
     if re.search(r" angular frequency [\d.e+-]+$", line):
         line = with_unit(line, rate_of("rad", units.time))
-    zero = re.fullmatch(r"((?:offset|drift|walk|hum|lag|jump) of \w+|lag from one sensor to the next): (\S+)(.*)", line)
+    zero = re.fullmatch(rf"({ZERO}|lag from one sensor to the next): (\S+)(.*)", line)
     if zero:
         factor, unit = of_natural(zero[1], units)
         line = f"{zero[1]}: {with_unit(f'{float(zero[2]) * factor:.{DIGITS}g}', unit)}{zero[3]}"

@@ -21,13 +21,18 @@ class Gain(OfSensors, acts="gain"):
 
     Attributes:
         both: whether velocities are read so, too.
+        alike: whether all of them have the same.
     """
 
     both: bool
+    alike: bool = False
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every site, and all that have an equation but the first, whose reading is the unit, at once."""
+        """Return every site, and all that have an equation but the first, whose reading is the unit, at once.
+
+        Besides, all sensors alike in each recording: a camera that stands elsewhere.
+        """
         chain = scene.chain
         if not effect.texts(chain.order, chain.is_complex):
             return
@@ -37,18 +42,25 @@ class Gain(OfSensors, acts="gain"):
             single = [(site,) for site in range(chain.sites)] if chain.sites > 1 or chain.levels > 1 else []
             for sites in [*single, *([others] if len(others) > 1 else [])]:
                 yield cls(effect=effect, sites=sites, both=both, strength=(0.0,) * len(sites))
+        for recording in scene.recordings:
+            every = tuple(range(chain.sites))
+            yield cls(
+                effect=effect, sites=every, recording=recording, both=chain.levels > 1, alike=True, strength=(0.0,)
+            )
 
     @property
     def place(self) -> tuple[object, ...]:
-        """The effect, the sites, and whether velocities are concerned."""
-        return (self.effect.name, self.sites, self.both)
+        """The effect, the sites, the recording, and whether velocities are concerned."""
+        return (*super().place, self.both)
 
     def turned(self) -> Placed | None:
         """Return the sensor with the other sign."""
-        return None if self.site is None else self.moved([-2.0 - self.strength[0]])
+        return None if self.site is None or self.alike else self.moved([-2.0 - self.strength[0]])
 
     def labels(self, chain: Chain) -> tuple[str, ...]:
         """Return the columns that are read wrongly."""
+        if self.alike:
+            return (f"gain of all sensors{self.then}",)
         return tuple(f"gain of {self._column(site, chain)}" for site in self.sites)
 
     def _column(self, site: int, chain: Chain) -> str:
@@ -61,17 +73,22 @@ class Gain(OfSensors, acts="gain"):
         by, slope = np.zeros((len(self.strength), *field.shape)), np.zeros_like(field)
         levels = slice(None) if self.both else slice(0, 1)
         for k, site in enumerate(self.sites):
-            by[k, :, levels, :, site] = field[:, levels, :, site]
-            slope[:, levels, :, site] = self.strength[k]
+            number = 0 if self.alike else k
+            by[number, :, levels, :, site] = field[:, levels, :, site]
+            slope[:, levels, :, site] = self.strength[number]
         return Misreading(np.tensordot(self.strength, by, 1), slope, by)
 
     def natural(self, chain: Chain, frequency: float) -> dict[str, float]:  # noqa: ARG002
         """Return the factors."""
+        if self.alike:
+            return {f"factor of all sensors{self.then}": 1 + self.strength[0]}
         pairs = zip(self.sites, self.strength, strict=True)
         return {f"factor of {self._column(site, chain)}": 1 + value for site, value in pairs}
 
     def sentences(self, chain: Chain) -> list[str]:
         """Return the factors."""
+        if self.alike:
+            return [f"all sensors read {1 + self.strength[0]:.{DIGITS}g} times as much{self.then} as in others"]
         found = []
         for site, value in zip(self.sites, self.strength, strict=True):
             factor, column = 1 + value, self._column(site, chain)

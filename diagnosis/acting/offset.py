@@ -29,7 +29,7 @@ class Offset(OfSensors, acts="offset"):
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every site, and all that have an equation at once."""
+        """Return every site, and all that have an equation at once; these in each recording, too."""
         chain = scene.chain
         if not effect.texts(chain.order, chain.is_complex):
             return
@@ -38,16 +38,22 @@ class Offset(OfSensors, acts="offset"):
             yield cls(
                 effect=effect, sites=sites, parts=chain.parts, every=every, strength=(0.0,) * (len(sites) * chain.parts)
             )
+        for recording in scene.recordings:
+            yield cls(
+                effect=effect, sites=chain.moving, recording=recording, parts=chain.parts, every=True,
+                strength=(0.0,) * (len(chain.moving) * chain.parts),
+            )  # fmt: skip
 
     @property
     def from_the_start(self) -> bool:
         """Whether it is of all sites: about a wrong zero a coupling looks like another one."""
-        return self.every
+        return self.every and self.recording is None
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the columns that are off."""
         columns = ("re", "im") if self.parts == 2 else ("u",)
-        return tuple(f"offset of {name}{site + 1}" for site in self.sites for name in columns)
+        then = f"{self.then} beyond others" if self.then else ""
+        return tuple(f"offset of {name}{site + 1}{then}" for site in self.sites for name in columns)
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
         """Return the offsets, and what each adds."""

@@ -84,6 +84,7 @@ class Scene:
         past: the smoothed field of each recording as a function of times, (B,) -> (parts, B, N).
         texts: the declared terms.
         inputs: whether an input was measured.
+        recordings: numbers of the recordings that may have zeros and units of their own.
     """
 
     chain: Chain
@@ -96,6 +97,7 @@ class Scene:
     past: tuple[Factor, ...]
     texts: tuple[str, ...]
     inputs: bool
+    recordings: tuple[int, ...] = ()
 
     @property
     def middle(self) -> float:
@@ -283,6 +285,10 @@ class Placed(ABC):
         """Whether its numbers are such as it may have."""
         return True
 
+    def acts_in(self, recording: int) -> bool:  # noqa: ARG002
+        """Return whether it is there in a recording, of which this is the number."""
+        return True
+
     def with_past(self, past: tuple[Factor, ...]) -> Self:  # noqa: ARG002
         """Return it with another field at earlier times, (B,) -> (parts, B, N) of each recording, where it is fed."""
         return self
@@ -412,11 +418,22 @@ class OfSensors(Placed):
 
     Attributes:
         sites: those of the sensors, from 0.
+        recording: the number of the only recording, from 0, in which they do so; None for all.
     """
 
     sites: tuple[int, ...]
+    recording: int | None = None
     instrument: ClassVar[bool] = True
     local: ClassVar[bool] = True
+
+    def acts_in(self, recording: int) -> bool:
+        """Return whether it is there in a recording."""
+        return self.recording in (None, recording)
+
+    @property
+    def then(self) -> str:
+        """In which recording, in words; "" for all."""
+        return "" if self.recording is None else f" in recording {self.recording + 1}"
 
     @property
     def site(self) -> int | None:
@@ -425,8 +442,8 @@ class OfSensors(Placed):
 
     @property
     def place(self) -> tuple[object, ...]:
-        """The effect and the sites."""
-        return (self.effect.name, self.sites)
+        """The effect, the sites, and the recording."""
+        return (self.effect.name, self.sites, self.recording)
 
 
 def times(value: float, text: str) -> str:

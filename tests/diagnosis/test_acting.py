@@ -125,7 +125,7 @@ def test_derivatives_of_readings_by_start_and_numbers_are_finite_differences_of_
         return follow(model.moved(numbers + change), layout, states).level
 
     # Other numbers are derived by as if an instrument's fault were small.
-    varied = range(model.blocks[0].start if model.instruments() else 0, len(numbers))
+    varied = range(model.blocks[0].start if model.instruments(0) else 0, len(numbers))
     for k in varied:
         change = step * max(1.0, abs(numbers[k])) * np.eye(len(numbers))[k]
         difference = (readings(change) - readings(-change)) / (2 * change[k])

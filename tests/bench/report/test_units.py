@@ -27,6 +27,7 @@ MIRRORED = Units(time="s", reading="mm", equation="m", scale=-0.001)
             "hum of u1: 0.002 to either side of u, at the angular frequency 6.86",
             "hum of u1: 2 mm to either side of u, at the angular frequency 6.86 rad/s",
         ),
+        ("offset of u1 in recording 2 beyond others: 0.02", "offset of u1 in recording 2 beyond others: -20 mm"),
         ("the ends are fixed", "the ends are fixed"),
     ],
 )
