@@ -104,7 +104,7 @@ def _when(factor: object) -> str:
     return "" if factor is None else str(factor)
 
 
-def corrected(model: Model, samples: Samples, recording: int = 0) -> Samples:
+def corrected(model: Model, samples: Samples, recording: int) -> Samples:
     """Return a recording as instruments without the model's faults would have read it; what is missing stays so.
 
     A zero that wanders is no number, and stays; so does a lag where no velocities were read.

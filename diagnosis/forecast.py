@@ -139,7 +139,7 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
 
 
 def _foreseeable(model: Model, ends: Sequence[float]) -> Model:
-    """Return a model without pulses whose middle the early readings do not show: nothing is known of their strength."""
+    """Return a model without what happens after the early readings, such as a pulse: they do not tell its strength."""
     seen = tuple(one for one in model.effects if one.begun(max(ends)))
     return replace(model, effects=seen)
 

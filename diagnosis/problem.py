@@ -145,7 +145,7 @@ class Problem:
             declared.texts,
             first.f is not None,
             # Of windows of one recording, none has a zero of its own.
-            tuple(range(count)) if len(parts) == (count := len(free)) and 1 < count <= SEVERAL else (),
+            tuple(map(_read, data)) if len(parts) == len(free) and 1 < len(free) <= SEVERAL else (),
         )
         candidates = tuple(one for effect in catalogue for one in way_of(effect).places(effect, scene))
         nodes = tuple(plain.pack(*both) for both in states)
@@ -305,6 +305,11 @@ def thinned(samples: Samples, top: float, fast: Float[ndarray, " lines"]) -> Sam
     step, near = mean_step(samples.t), rules.AROUND * np.pi / float(samples.t[-1] - samples.t[0])
     stride = min(strides, key=lambda k: hidden(fast, k * step, FARTHER * top, near)) if len(fast) else strides[0]
     return samples.of_rows(slice(None, None, stride))
+
+
+def _read(samples: Samples) -> tuple[int, ...]:
+    """Return the sites that were read."""
+    return tuple(site for site in range(samples.sites) if site not in samples.unread)
 
 
 def around(part: Samples, whole: Samples) -> Samples | None:

@@ -423,10 +423,10 @@ class Search:
     def climbed(self, model: Model, fitted: Fitted, hope: float) -> Fitted | None:
         """Return the fit of a model from short pieces up to those of another fit; None where the way ends before.
 
-        On shorter pieces, which have more starts of their own, it costs less: where that is above `hope` already, the
-        way ends.
+        On shorter pieces of the same readings, which have more starts of their own, it costs less: where that is above
+        `hope` already, the way ends.
         """
-        found = None
+        found, readings = None, fitted.layout.readings()
         for length in self.lengths[1:-1:CLIMBING]:
             layout = self.layout(length)
             if found is None:
@@ -436,7 +436,7 @@ class Search:
                 found = self.refit(model, ready, near, fitted, FIRST)
             else:
                 found = self.carry(found, layout)
-            if found is None or found.cost > hope:
+            if found is None or (found.cost > hope and layout.readings() == readings):
                 return None
         return None if found is None else self.carry(found, fitted.layout, hope=hope)
 

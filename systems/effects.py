@@ -21,8 +21,8 @@ HOW: dict[str, str] = {
     "harmonic at one site": "the same at one site only; omega and site found",
     "pulse": "the formula times exp(-((t - at) / width)^2 / 2), at every site alike; at and width found",
     "pulse at one site": "the same at one site only; at, width and site found",
-    "ramp": "a declared term, or the formula, times s / T, s counted from the middle, T being the recording's length; "
-    "term found",
+    "ramp": "a declared term, or the formula, times s / T, s counted from the middle, T being the length of "
+    "the longest recording; term found",
     "step": "a declared term, or the formula, from one time on; term and time found",
     "delayed": "the formula of the field a delay earlier; delay found",
     "long range": "sum over r >= 2 of (u_{n+r} + u_{n-r} - 2 u_n) / r^s; s found",
@@ -34,13 +34,15 @@ HOW: dict[str, str] = {
     "other, with a coefficient for each bond",
     "one equation": "the whole right-hand side of one site is scaled; site found",
     "ends": "the chain ends in another way than declared",
-    "offset": "the reading is u + b; at one site, which is found, or with a b for every site",
+    "offset": "the reading is u + b; at one site, which is found, or with a b for every site, in "
+    "all recordings or in one",
     "drift": "the reading is u + d (t - t_0) / T, T being the recording's length; at one site, which is found",
     "jump": "the reading is u + b from one time on; at one site; time and site found",
     "wander": "the reading is u + w(t), w wandering at random, more slowly than the sites swing; at one site, found",
     "hum": "the reading is u + a cos(omega s) + b sin(omega s), s counted from the middle; at one site or at all "
     "alike; omega and site found",
-    "gain": "the reading is g u; at one site, which is found, or with a g for every site",
+    "gain": "the reading is g u; at one site, which is found, with a g for every site, or "
+    "with one for all in a recording",
     "curve": "the reading is u + c T(u), T being a power, with one c for all sensors or at one of them",
     "lag": "the reading is u - tau v, which is u a time tau ago; at one site, which is found, with a tau for every "
     "site, or with one more tau at each",

@@ -72,9 +72,12 @@ class Layout:
         Raises:
             InputError: they are no two times, one after the other.
         """
-        first, last = self.between
+        try:
+            first, last = (float(time) for time in self.between)
+        except (TypeError, ValueError):
+            raise InputError(f"{option('between')}: give two times, such as (2.0, inf)") from None
         if not first < last:
-            raise InputError(f"{option('between', self.between)}: give a time and a later one; inf for the last")
+            raise InputError(f"{option('between', (first, last))}: give a time and a later one; inf for the last")
         return first, last
 
     @property

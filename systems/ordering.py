@@ -51,34 +51,6 @@ def in_order(arrays: Arrays, source: str, column: str, *, sort: bool) -> tuple[A
     return found, [f"{early} row(s) came too late; all are put in the order of their times"]
 
 
-def within(arrays: Arrays, stretch: tuple[float, float], source: str) -> tuple[Arrays, list[str]]:
-    """Return the rows from one time to another, and what to say of it.
-
-    Args:
-        arrays: t, u, v, f.
-        stretch: both times, in the unit of the file.
-        source: where they come from.
-
-    Raises:
-        InputError: fewer than two rows are left.
-    """
-    t, (first, last) = arrays["t"], stretch
-    assert t is not None
-    # What is no time is refused by the samples.
-    beyond = (t < first) | (t > last)
-    if not np.any(beyond):
-        return arrays, []
-    left = np.count_nonzero(~beyond)
-    if left < 2:
-        raise InputError(
-            f"{source}: {option('between', stretch)}: {left} row(s) are there; a motion needs at least 2, and times go "
-            f"from {np.nanmin(t):g} to {np.nanmax(t):g}"
-        )
-    found = {name: None if array is None else array[~beyond] for name, array in arrays.items()}
-    sides = [f"{word} {time:g}" for word, time in (("before", first), ("after", last)) if np.isfinite(time)]
-    return found, [f"rows {' or '.join(sides)} are not read: {len(t) - left} of {len(t)}"]
-
-
 def unwrapped(u: ndarray, turn: float, source: str) -> ndarray:
     """Return readings (T, N) that go on where they started anew after a full turn, along time and then along the chain.
 

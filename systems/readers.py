@@ -24,7 +24,7 @@ from latticebench.systems.folders import ZARR, files_in, partition, zarr_arrays
 from latticebench.systems.layout import UNITS, Layout, choose, quoted
 from latticebench.systems.npz import ARRAYS, check_names, read_npz
 from latticebench.systems.options import option
-from latticebench.systems.ordering import averaged, in_order, unwrapped, within
+from latticebench.systems.ordering import averaged, in_order, unwrapped
 from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 from latticebench.systems.tables import DASHES, Table, check_count, named_once, read_csv, read_sheet
@@ -169,8 +169,6 @@ def _samples(arrays: Arrays, told: _Told) -> Samples:
     if told.layout.sort:
         arrays, notes = averaged(arrays)
         origin = origin.noting(*notes)
-    arrays, notes = within(arrays, told.layout.stretch, told.source)
-    origin = origin.noting(*notes)
     t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
     assert t is not None
     assert u is not None
@@ -178,7 +176,27 @@ def _samples(arrays: Arrays, told: _Told) -> Samples:
         u, v = u * origin.scale, None if v is None else v * origin.scale
     if pace != 1:
         t, v = t * pace, None if v is None else v / pace
-    return Samples(t, u, v, f, None, told.source, told.ends, origin)
+    return _within(Samples(t, u, v, f, None, told.source, told.ends, origin), told.layout)
+
+
+def _within(samples: Samples, layout: Layout) -> Samples:
+    """Return the rows of the times that are to be read.
+
+    Raises:
+        InputError: fewer than two rows are left.
+    """
+    (first, last), t = layout.stretch, samples.t / layout.time_factor
+    begin, end = int(np.searchsorted(t, first)), int(np.searchsorted(t, last, side="right"))
+    if (left := end - begin) == len(t):
+        return samples
+    if left < 2:
+        raise InputError(
+            f"{samples.source}: {option('between', (first, last))}: {left} row(s) are there; a motion needs at least "
+            f"2, and times go from {t[0]:g} to {t[-1]:g}"
+        )
+    sides = [f"{word} {time:g}" for word, time in (("before", first), ("after", last)) if np.isfinite(time)]
+    said = f"rows {' or '.join(sides)} are not read: {len(t) - left} of {len(t)}"
+    return replace(samples.of_rows(slice(begin, end)), origin=samples.origin.noting(said))
 
 
 # CSV and Parquet

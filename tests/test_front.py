@@ -337,6 +337,7 @@ WRONG_CALLS = {
     "a column twice": lambda: lb.read(pd.DataFrame({"t": TIMES, "a": TIMES}), columns=["a", "a"]),
     "no scale": lambda: lb.read(TIMES, time=TIMES, scale="furlong"),
     "no time scale": lambda: lb.read(TIMES, time=TIMES, time_scale="moon"),
+    "half a stretch": lambda: lb.read(TIMES, time=TIMES, between=(2,)),
     "no stretch": lambda: lb.read(TIMES, time=TIMES, between=(2, 1)),
     "no turn": lambda: lb.read(TIMES, time=TIMES, turn=-1),
     "unsorted": lambda: lb.read(TIMES, time=TIMES[::-1]),

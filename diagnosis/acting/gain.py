@@ -42,11 +42,11 @@ class Gain(OfSensors, acts="gain"):
             single = [(site,) for site in range(chain.sites)] if chain.sites > 1 or chain.levels > 1 else []
             for sites in [*single, *([others] if len(others) > 1 else [])]:
                 yield cls(effect=effect, sites=sites, both=both, strength=(0.0,) * len(sites))
-        for recording in scene.recordings:
-            every = tuple(range(chain.sites))
-            yield cls(
-                effect=effect, sites=every, recording=recording, both=chain.levels > 1, alike=True, strength=(0.0,)
-            )
+        for recording, read in enumerate(scene.recordings):
+            if read:
+                yield cls(
+                    effect=effect, sites=read, recording=recording, both=chain.levels > 1, alike=True, strength=(0.0,)
+                )
 
     @property
     def place(self) -> tuple[object, ...]:

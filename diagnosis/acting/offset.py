@@ -38,11 +38,13 @@ class Offset(OfSensors, acts="offset"):
             yield cls(
                 effect=effect, sites=sites, parts=chain.parts, every=every, strength=(0.0,) * (len(sites) * chain.parts)
             )
-        for recording in scene.recordings:
-            yield cls(
-                effect=effect, sites=chain.moving, recording=recording, parts=chain.parts, every=True,
-                strength=(0.0,) * (len(chain.moving) * chain.parts),
-            )  # fmt: skip
+        for recording, read in enumerate(scene.recordings):
+            sites = tuple(site for site in chain.moving if site in read)
+            if sites:
+                yield cls(
+                    effect=effect, sites=sites, recording=recording, parts=chain.parts, every=sites == chain.moving,
+                    strength=(0.0,) * (len(sites) * chain.parts),
+                )  # fmt: skip
 
     @property
     def from_the_start(self) -> bool:

@@ -84,7 +84,7 @@ class Scene:
         past: the smoothed field of each recording as a function of times, (B,) -> (parts, B, N).
         texts: the declared terms.
         inputs: whether an input was measured.
-        recordings: numbers of the recordings that may have zeros and units of their own.
+        recordings: the sites that were read in each recording, where each may have zeros and units of its own.
     """
 
     chain: Chain
@@ -97,7 +97,7 @@ class Scene:
     past: tuple[Factor, ...]
     texts: tuple[str, ...]
     inputs: bool
-    recordings: tuple[int, ...] = ()
+    recordings: tuple[tuple[int, ...], ...] = ()
 
     @property
     def middle(self) -> float:
@@ -444,6 +444,10 @@ class OfSensors(Placed):
     def place(self) -> tuple[object, ...]:
         """The effect, the sites, and the recording."""
         return (self.effect.name, self.sites, self.recording)
+
+    def settings(self) -> dict[str, float | int | str]:
+        """Return the site and the recording, where it is one, both from 1."""
+        return super().settings() | ({} if self.recording is None else {"recording": self.recording + 1})
 
 
 def times(value: float, text: str) -> str:

@@ -89,4 +89,4 @@ class Step(Placed, acts="step"):
     def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
         """Return by how much the coefficient changes, and when."""
         more = f"{self.strength[0]:.{DIGITS}g}"
-        return [f"from t = {self.at:.{DIGITS}g} on, the coefficient of {self.text} is larger by {more}"]
+        return [f"from t = {self.at:.{DIGITS}g} on, the coefficient of {self.text} changes by {more}"]

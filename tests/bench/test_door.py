@@ -67,6 +67,20 @@ def write_pendula(path: Path, step: float = 0.025) -> None:
     path.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8-sig")
 
 
+@pytest.mark.parametrize("command", ["inspect", "diagnose", "fit", "limit", "plot"])
+def test_every_command_reads_the_stretch_that_it_is_told(typed, command):
+    more = {"diagnose": MODEL, "fit": [*MODEL, "--method", "stlsq"], "limit": MODEL, "plot": ["--out", "x.png"]}
+    _, told = typed(command, "pendula.csv", *READING, *more.get(command, []), "--between", "30", "60", code=2)
+    assert "--between 30 60: 0 row(s) are there" in told
+    assert "times go from 0 to 19.975" in told
+
+
+def test_the_beginning_of_a_recording_can_be_left_out(typed, tmp_path):
+    shown, told = typed("inspect", "pendula.csv", *READING, "--between", "5", "inf")
+    assert "600 rows; t = 5 to 19.975" in shown
+    assert "rows before 5 are not read: 200 of 800" in told + shown
+
+
 def test_the_refusal_names_the_options_that_read_the_file(typed: Typed) -> None:
     _, told = typed("inspect", "pendula.csv", code=2)
     assert 'read it with --time time_s --columns "theta_*_deg" --scale deg' in told

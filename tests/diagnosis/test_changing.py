@@ -10,7 +10,7 @@ from latticebench.diagnosis.acting import WAYS
 from latticebench.diagnosis.acting.jump import Rise
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
-from latticebench.systems.effects import CATALOGUE, find
+from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
 
@@ -90,4 +90,3 @@ def test_a_step_is_sharp_for_what_moves_and_no_sharper():
     assert isinstance(factor, Rise)
     np.testing.assert_allclose(factor(WHEN + np.array([-0.1, 0.0, 0.1]))[0, :, 0], [0.0, 0.5, 1.0], atol=0.02)
     assert factor.wide == pytest.approx(0.1 / problem.top, rel=1e-6)
-    assert find("coefficient-jump").acts == "step"

@@ -155,5 +155,5 @@ def test_a_missing_velocity_concerns_the_sensor_that_lags_alone():
     late = WAYS["lag"](effect=find("sensor-lag"), sites=(1,), strength=(0.1,))
     v = np.ones((4, 3))
     v[2] = np.nan
-    found = corrected(Model(DECLARED, 2, TRUTH, (late,)), Samples(T[:4], np.zeros((4, 3)), v, ends="free"))
+    found = corrected(Model(DECLARED, 2, TRUTH, (late,)), Samples(T[:4], np.zeros((4, 3)), v, ends="free"), 0)
     np.testing.assert_allclose(found.u, [[0, 0.1, 0], [0, 0.1, 0], [0, np.nan, 0], [0, 0.1, 0]], atol=1e-12)

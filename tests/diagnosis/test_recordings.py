@@ -6,9 +6,11 @@ import functools
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
+import latticebench as lb
 from latticebench.diagnosis.acting import WAYS
 from latticebench.diagnosis.cure import corrected
 from latticebench.diagnosis.horizon import Layout, follow, linearised
@@ -51,11 +53,28 @@ def test_zeros_that_were_set_anew_are_named_with_their_recording():
     found = diagnose(DECLARED, 2, recordings(ZEROS), (*INSTRUMENT, find("damping")))
     offsets = [one for one in found.findings if one.name == "sensor-offset"]
     assert (found.verdict, {one.name for one in found.findings}) == ("explained", {"sensor-offset", "damping"})
+    assert [one.placed.settings().get("recording") for one in offsets].count(None) < len(offsets)
     model = replace(found.after.model, effects=tuple(one.placed for one in offsets))
     still = Samples(T, np.zeros((len(T), 2)), source="still", ends="free")
     # Whichever recording is said to differ from the other.
     zeros = [-corrected(model, still, number).u[0] for number in (0, 1)]
     np.testing.assert_allclose(zeros, [[0, 0], ZEROS], atol=0.001)
+
+
+def test_readings_are_corrected_by_what_their_own_recording_has():
+    made = recordings(ZEROS)
+    rows = [pd.DataFrame({"trajectory": k, "t": T, "u1": one.u[:, 0], "u2": one.u[:, 1]}) for k, one in enumerate(made)]
+    cause = lb.diagnose(lb.read(pd.concat(rows)), lb.Model("; ".join(DECLARED.texts), order=2, ends="free"))
+    for number, (one, right) in enumerate(zip(cause.corrected.samples, made, strict=True)):
+        np.testing.assert_allclose(one.u, right.u - number * ZEROS, atol=0.001)
+
+
+def test_a_sensor_that_read_nothing_then_has_no_zero_of_its_own_in_a_recording():
+    one, other = recordings(ZEROS)
+    dead = replace(other, u=np.where([True, False], np.nan, other.u))
+    problem = Problem.of(DECLARED, 2, [one, dead], CATALOGUE)
+    own = {each.recording: each.sites for each in problem.candidates if each.effect.name == "sensor-offset"}
+    assert (own[0], own[1]) == ((0, 1), (1,))
 
 
 def test_a_camera_that_stands_elsewhere_has_a_scale_of_its_own():

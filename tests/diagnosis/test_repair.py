@@ -130,7 +130,7 @@ def test_a_hum_of_one_sensor_is_named_with_its_size_and_its_frequency_and_can_be
     assert abs(value - omega) < 4 * error < 0.1 * omega
     assert np.linalg.norm(one.placed.strength) == pytest.approx(size, rel=0.15)
     assert found.residual[1] == pytest.approx(1, abs=0.1)
-    left = corrected(found.after.model, found.data[0]).u - recording.samples.u
+    left = corrected(found.after.model, found.data[0], 0).u - recording.samples.u
     assert np.sqrt(np.mean(left**2)) < 0.1 * size
 
 

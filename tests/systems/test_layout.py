@@ -241,6 +241,12 @@ def test_times_beyond_the_stretch_that_is_asked_for_are_left_out_in_the_unit_of_
     assert [note for note in one.origin.notes if note.startswith("rows")] == ([said] if said else [])
 
 
+def test_rows_are_counted_from_the_first_of_the_file(tmp_path):
+    path = written(tmp_path, "t,u1\n0,1\n1,2\n2,3\n3,inf\n")
+    with pytest.raises(InputError, match="row 4, column u1: infinite"):
+        read(path, layout=Layout(between=(1, np.inf)))
+
+
 def test_an_average_leaves_missing_values_out(tmp_path):
     path = written(tmp_path, "t,u1,u2\n0,1,\n0,,\n1,2,3\n")
     (one,) = read(path, layout=Layout(sort=True))

@@ -42,7 +42,14 @@ WAVE = r"(?:hum of u\d*, )?(cos|sin)\(.*\*(?:t|\(t([+-][^()]*)\))\)"
 # The label of a declared term whose coefficient changes steadily.
 RAMP = r"(?:t|\(t[^()]*\))/([\d.e+-]+)\*(.*)"
 # Labels of values that are no coefficient of a term, with the names that recordings have for them.
-NAMED = {"omega": "omega", "curve of u": "curve", "cubic curve of u": "cubic", "scale": "scale"}
+NAMED = {
+    "omega": "omega",
+    "at": "at",
+    "width": "width",
+    "curve of u": "curve",
+    "cubic curve of u": "cubic",
+    "scale": "scale",
+}
 # Half the width of a 95 % interval, in standard errors.
 HALF = 1.959964
 # A forecast is worse when its error has grown by more than this share of itself.
@@ -84,7 +91,7 @@ def called(values: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
     """
     found = {}
     for label, (value, error) in values.items():
-        sensor, wave = re.match(r"(offset|gain|curve|lag|jump) of u(\d+)", label), re.match(WAVE, label)
+        sensor, wave = re.match(r"(offset|gain|curve|lag|jump) of u(\d+)(?: and v\d+)?$", label), re.match(WAVE, label)
         ramp = re.fullmatch(RAMP, label)
         if sensor is not None:
             found[f"{sensor[1]}_{sensor[2]}"] = (value + (sensor[1] == "gain"), error)

@@ -18,8 +18,8 @@ MIRRORED = Units(time="s", reading="mm", equation="m", scale=-0.001)
         ("drift of u3: -0.5 over the recording", "drift of u3: 500 mm over the recording"),
         ("jump of u3: -0.5 at t = 17.2", "jump of u3: 500 mm at t = 17.2 s"),
         (
-            "from t = 25.1 on, the coefficient of u[n] is larger by -0.5",
-            "from t = 25.1 s on, the coefficient of u[n] is larger by -0.5",
+            "from t = 25.1 on, the coefficient of u[n] changes by -0.5",
+            "from t = 25.1 s on, the coefficient of u[n] changes by -0.5",
         ),
         # A standard deviation has no sign, whichever way the sensor counts.
         ("walk of u2: 0.5 over the recording, and so on", "walk of u2: 500 mm over the recording, and so on"),
