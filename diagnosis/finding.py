@@ -142,6 +142,7 @@ def findings(found: Compared) -> tuple[Finding, ...]:
     for k, (placed, block) in enumerate(zip(model.effects, model.blocks, strict=True)):
         names = (*placed.labels(found.fitted.chain), *placed.shape)
         numbers = zip(placed.numbers, errors[block], strict=True)
-        values = {name: (float(value), float(error)) for name, (value, error) in zip(names, numbers, strict=True)}
+        known = ((name, pair) for name, pair in zip(names, numbers, strict=True) if name not in placed.moot)
+        values = {name: (float(value), float(error)) for name, (value, error) in known}
         every.append(Finding(placed, found.alternatives[k], found.evidence[k], values))
     return tuple(every)

@@ -115,7 +115,7 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
         model = fitted.model.of_others(len(problem.data))
     else:
         other, share, steps = problem, 1 - HELD_OUT, STEPS
-        model = _foreseeable(fitted.model, [one.t[round(len(one.t) * share)] for one in problem.data])
+        model = _foreseeable(fitted.model, _ends(problem))
     other = replace(other, plain=replace(other.plain, rest=fitted.layout.plain.rest))
     early = other.first(share)
     layout = Layout.of(early, max(len(one.t) for one in early.data), None, fitted.layout.small, fitted.layout.memory)
@@ -138,10 +138,35 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
     return [_follow(model, again, other, number) for number in range(len(other.records))]
 
 
-def _foreseeable(model: Model, ends: Sequence[float]) -> Model:
+def unforeseen(model: Model, problem: Problem) -> float:
+    """Return the time of the first thing that happens in a model after the early readings; infinity for none.
+
+    What comes later can be foreseen neither by this model nor by one that lacks what happens.
+    """
+    later = (one.begins for one in model.effects if one.begins > _ends(problem))
+    return min(later, default=np.inf)
+
+
+def up_to(forecasts: Sequence[Prediction], time: float) -> list[Prediction]:
+    """Return forecasts up to a time; all of each where nothing would be left of it."""
+    found = []
+    for one in forecasts:
+        rows = one.t < time
+        if np.any(rows) and not np.all(rows):
+            part = Prediction(one.t[rows], one.seen[rows], one.predicted[rows], 0.0)
+            one = replace(part, error=pooled([part]))
+        found.append(one)
+    return found
+
+
+def _ends(problem: Problem) -> float:
+    """Return the last time of all early readings."""
+    return max(float(one.t[round(len(one.t) * (1 - HELD_OUT))]) for one in problem.data)
+
+
+def _foreseeable(model: Model, end: float) -> Model:
     """Return a model without what happens after the early readings, such as a pulse: they do not tell its strength."""
-    seen = tuple(one for one in model.effects if one.begun(max(ends)))
-    return replace(model, effects=seen)
+    return replace(model, effects=tuple(one for one in model.effects if one.begins <= end))
 
 
 def _from(fitted: Fitted, layout: Layout, early: Problem) -> list[ndarray]:

@@ -146,6 +146,7 @@ class Problem:
             first.f is not None,
             # Of windows of one recording, none has a zero of its own.
             tuple(map(_read, data)) if len(parts) == len(free) and 1 < len(free) <= SEVERAL else (),
+            step,
         )
         candidates = tuple(one for effect in catalogue for one in way_of(effect).places(effect, scene))
         nodes = tuple(plain.pack(*both) for both in states)

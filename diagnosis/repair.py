@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from latticebench.diagnosis import modes, rules
 from latticebench.diagnosis.finding import Compared, Finding, compared, findings
 from latticebench.diagnosis.fitting import Fitted
-from latticebench.diagnosis.forecast import Prediction, ahead, by_noise, pooled, predict
+from latticebench.diagnosis.forecast import Prediction, ahead, by_noise, pooled, predict, unforeseen, up_to
 from latticebench.diagnosis.held import Held, freed
 from latticebench.diagnosis.inputs import in_words
 from latticebench.diagnosis.instrument import dead_sensors, describe, without
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
 One = TypeVar("One")
+# Forecasts of a fit, up to what another one has happening later than the early readings.
+Foreseen = Callable[[Fitted, Fitted], "list[Prediction]"]
 
 # Why named effects may explain only a part.
 SMALL, NAMELESS = "something small is left", "something without a name does better"
@@ -181,8 +183,11 @@ def diagnose(
 
         # Models are forecast once, to be named and to be reported.
         @functools.cache
-        def foreseen(fitted: Fitted) -> list[Prediction]:
+        def forecast(fitted: Fitted) -> list[Prediction]:
             return predict(fitted, search.problem, held_out)
+
+        def foreseen(fitted: Fitted, beside: Fitted) -> list[Prediction]:
+            return up_to(forecast(fitted), np.inf if held_out else unforeseen(beside.model, search.problem))
 
         recorded = sum(len(one.t) for one in shown) - sum(one.rows for one in problem.held)
         try:
@@ -290,7 +295,7 @@ def _check_room(problem: Problem) -> None:
         )
 
 
-def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Prediction]]) -> Compared:
+def _named(search: Search, found: Found, foreseen: Foreseen) -> Compared:
     """Return the best model after exchanges, without effects that make the forecast worse."""
     search.say("trying what could stand in the place of each effect")
     best = compared(search, found.models[0])
@@ -298,21 +303,20 @@ def _named(search: Search, found: Found, foreseen: Callable[[Fitted], list[Predi
     best = best if plainer is None else plainer
     if not best.fitted.model.effects:
         return best
-    before, now = (pooled(foreseen(one)) for one in (found.before, best.fitted))
+    named = best.fitted
+    before, now = (pooled(foreseen(one, named)) for one in (found.before, named))
     of_u = best.fitted.rms[: search.problem.chain.sites]
     least = rules.BEYOND_NOISE * float(np.sqrt(np.nanmean(of_u**2))) / search.problem.height
     while best.fitted.model.effects and now > max((1 + rules.WORSE) * before, least):
         search.say("the forecast is worse than before: trying without each effect, the weakest first")
-        better = _with_one_less(search, best, now, foreseen)
+        better = _with_one_less(search, best, now, lambda one: pooled(foreseen(one, named)))
         if better is None:
             break
         best, now = better
     return best
 
 
-def _plainer(
-    search: Search, best: Fitted, rivals: Sequence[Fitted], foreseen: Callable[[Fitted], list[Prediction]]
-) -> Compared | None:
+def _plainer(search: Search, best: Fitted, rivals: Sequence[Fitted], foreseen: Foreseen) -> Compared | None:
     """Return the best rival without influences that may stand in for something else; None if it is not the better one.
 
     It is where it forecasts better by more nats than it is behind, and leaves of the forecast little more than noise.
@@ -322,9 +326,10 @@ def _plainer(
     if plain is None or not best.model.may_stand_in:
         return None
     behind, noise = worth.value(plain) - worth.value(best), np.maximum(plain.rms, search.problem.finest)
-    if behind > rules.PLAINER or pooled(foreseen(plain)) > rules.BEYOND_NOISE * by_noise(foreseen(plain), noise):
+    its, other = foreseen(plain, best), foreseen(best, best)
+    if behind > rules.PLAINER or pooled(its) > rules.BEYOND_NOISE * by_noise(its, noise):
         return None
-    if ahead(foreseen(plain), foreseen(best), noise) / best.dispersion <= behind:
+    if ahead(its, other, noise) / best.dispersion <= behind:
         return None
     search.say("the forecast is better without influences that have a frequency or a time of their own")
     found = compared(search, plain)
@@ -346,12 +351,12 @@ def _decided(search: Search, found: Found, best: Fitted) -> Found:
 
 
 def _with_one_less(
-    search: Search, best: Compared, now: float, foreseen: Callable[[Fitted], list[Prediction]]
+    search: Search, best: Compared, now: float, forecast: Callable[[Fitted], float]
 ) -> tuple[Compared, float] | None:
     """Return a model without the weakest effect that makes the forecast worse, and its error; None where none does."""
     for number in np.argsort(best.evidence):
         fitted = search.without(best.fitted, int(number))
-        error = np.inf if fitted is None else pooled(foreseen(fitted))
+        error = np.inf if fitted is None else forecast(fitted)
         if fitted is not None and error < now:
             kept = [k for k in range(len(best.evidence)) if k != number]
             evidence = tuple(best.evidence[k] for k in kept)
@@ -364,7 +369,7 @@ def _diagnosis(
     found: Found,
     best: Compared,
     left: tuple[Left, ...],
-    foreseen: Callable[[Fitted], list[Prediction]],
+    foreseen: Foreseen,
     recorded: int,
     dead: tuple[int, ...],
 ) -> Diagnosis:
@@ -388,7 +393,7 @@ def _diagnosis(
         residual=both(lambda one: _over(one, noise)),
         rms=both(lambda one: float(np.sqrt(np.nanmean(one.left**2)))),
         dynamics=both(lambda one: _dynamics(problem, one)),
-        forecasts=both(foreseen),
+        forecasts=both(lambda one: foreseen(one, after)),
         criterion=(0.0, more * float(np.log(after.layout.readings())) - gain),
         declared=both(lambda one: np.array(one.model.coefficients[:count])),
         modes=(modes.of_recording(problem), modes.of_model(before), modes.of_model(after)),

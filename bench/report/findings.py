@@ -98,13 +98,16 @@ def _with_errors(one: Finding, function: Callable[[Placed], Mapping[str, float |
 
     Correlations between the numbers of one effect are left out: each of what is said of an effect rests on one of them.
     """
-    here = one.placed.numbers
-    errors = np.array([error for _, error in one.values.values()])
-    found = _floats(function(one.placed))
+    here, moot = one.placed.numbers, one.placed.moot
+    names = (*[""] * len(one.placed.strength), *one.placed.shape)
+    errors = np.zeros(len(here))
+    errors[[name not in moot for name in names]] = [error for _, error in one.values.values()]
+    found = {name: value for name, value in _floats(function(one.placed)).items() if name not in moot}
     slopes = {name: np.zeros(len(here)) for name in found}
     for k, error in enumerate(errors):
         step = STEP * (error if error > 0 and np.isfinite(error) else max(abs(here[k]), STEP))
         moved = _floats(function(one.placed.moved(here + step * np.eye(len(here))[k])))
+        moved = {name: value for name, value in moved.items() if name not in moot}
         # Labels contain numbers, such as the time of a pulse: after a step the same entry may have another name.
         there = dict(zip(found, moved.values(), strict=True)) if len(moved) == len(found) else moved
         for name, value in found.items():

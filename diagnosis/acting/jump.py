@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-# The width of a jump between two readings, over the shortest time in which the motion changes by a radian: any smaller
-# one does the same, and time and width are known the less.
-SHARP = 0.02
+# The width of a jump over the shortest time in which the motion changes by a radian, or over the time between two
+# readings, whichever is more: a smaller one hardly does anything else, and of its time less is known.
+SHARP, BETWEEN = 0.02, 0.2
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,13 @@ class Jump(OfSensors, acts="jump"):
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return every site that has an equation, at times all over the recording."""
         chain, apart = scene.chain, scene.span / MOST_MIDDLES
+        least = max(SHARP / scene.top, BETWEEN * scene.step)
         if not effect.texts(chain.order, chain.is_complex):
             return
         for site in chain.moving:
             for at in scene.begin + apart * np.arange(1, MOST_MIDDLES):
                 yield cls(
-                    effect=effect, sites=(site,), at=float(at), width=apart / 2, least=SHARP / scene.top,
+                    effect=effect, sites=(site,), at=float(at), width=apart / 2, least=least,
                     seen=scene.seen, parts=chain.parts, strength=(0.0,) * chain.parts,
                 )  # fmt: skip
 
@@ -104,9 +105,15 @@ class Jump(OfSensors, acts="jump"):
         """Whether it happens between the first and the last time: before and after it is an offset."""
         return self.seen[0] < self.at < self.seen[1]
 
-    def begun(self, t: float) -> bool:
-        """Return whether it happens before a time."""
-        return self.at <= t
+    @property
+    def moot(self) -> tuple[str, ...]:
+        """The width of what is as sharp as can be."""
+        return ("width",) if abs(self.width) < self.least else ()
+
+    @property
+    def begins(self) -> float:
+        """When it happens."""
+        return self.at
 
     def share(self, chain: Chain) -> Float[ndarray, " sites"]:
         """Return 1 at the sensor, 0 elsewhere."""

@@ -85,6 +85,7 @@ class Scene:
         texts: the declared terms.
         inputs: whether an input was measured.
         recordings: the sites that were read in each recording, where each may have zeros and units of its own.
+        step: a typical time between readings.
     """
 
     chain: Chain
@@ -98,6 +99,7 @@ class Scene:
     texts: tuple[str, ...]
     inputs: bool
     recordings: tuple[tuple[int, ...], ...] = ()
+    step: float = 0.0
 
     @property
     def middle(self) -> float:
@@ -276,9 +278,15 @@ class Placed(ABC):
         """Return those of its kind that act nearly, but plainly not as it does; none where no such order is known."""
         return ()
 
-    def begun(self, t: float) -> bool:  # noqa: ARG002
-        """Return whether readings before a time show it."""
-        return True
+    @property
+    def moot(self) -> tuple[str, ...]:
+        """Names of numbers that make no difference as they are, so that nothing is known of them."""
+        return ()
+
+    @property
+    def begins(self) -> float:
+        """The time from which readings show it."""
+        return -np.inf
 
     @property
     def possible(self) -> bool:
@@ -346,7 +354,7 @@ class Placed(ABC):
     def settings(self) -> dict[str, float | int | str]:
         """Return where and how it acts, for people: the site (from 1), a frequency, a delay, ..."""
         found: dict[str, float | int | str] = {} if self.site is None else {"site": self.site + 1}
-        return found | {name: float(getattr(self, name)) for name in self.shape}
+        return found | {name: float(getattr(self, name)) for name in self.shape if name not in self.moot}
 
     def natural(self, chain: Chain, frequency: float) -> dict[str, float]:  # noqa: ARG002
         """Return its numbers in the form in which people know them, by what they are: factors, mass ratios, times.

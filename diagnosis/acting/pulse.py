@@ -101,9 +101,10 @@ class Pulse(Placed, acts="pulse"):
         """Whether its middle is between the first and the last time: a flank alone tells no strength, time or width."""
         return self.seen[0] <= self.at <= self.seen[1]
 
-    def begun(self, t: float) -> bool:
-        """Return whether its middle is before a time: later, its strength is not known."""
-        return self.at <= t
+    @property
+    def begins(self) -> float:
+        """Its middle: before, its strength is not known."""
+        return self.at
 
     def forces(self, chain: Chain) -> list[Force]:
         """Return the pulse and, for middle and width, its derivatives by them."""

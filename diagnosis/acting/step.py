@@ -64,9 +64,15 @@ class Step(Placed, acts="step"):
         """Whether it happens between the first and the last time: before and after it is another coefficient."""
         return self.seen[0] < self.at < self.seen[1]
 
-    def begun(self, t: float) -> bool:
-        """Return whether it happens before a time."""
-        return self.at <= t
+    @property
+    def moot(self) -> tuple[str, ...]:
+        """The width of what is as sharp as can be."""
+        return ("width",) if abs(self.width) < self.least else ()
+
+    @property
+    def begins(self) -> float:
+        """When it happens."""
+        return self.at
 
     @property
     def _wide(self) -> float:
