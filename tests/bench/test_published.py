@@ -137,6 +137,8 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     assert f"and {share(still['unexplained'])} were `unexplained` or partly so" in words("diagnosis")
     lag = pd.read_csv(RESULTS / "loop" / "lag" / "summary.csv", comment="#", dtype=str)
     assert f"`results/loop/lag`): {share(lag['right'].iloc[0])}." in words("diagnosis")
+    lens = pd.read_csv(RESULTS / "loop" / "lens" / "summary.csv", comment="#", dtype=str)
+    assert f"`results/loop/lens`): {share(lens['right'].iloc[0])}." in words("diagnosis")
     jump = pd.read_csv(RESULTS / "loop" / "jump" / "summary.csv", comment="#", dtype=str)
     assert f"`results/loop/jump`): {share(jump['right'].iloc[0])}." in words("diagnosis")
     effects = pd.read_csv(RESULTS / "loop" / "jump" / "effects.csv", comment="#", dtype=str).set_index("effect")
