@@ -25,7 +25,6 @@ from latticebench.bench.cli.reading import (
     read_told,
 )
 from latticebench.systems.errors import InputError
-from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.report.content import Report
@@ -74,7 +73,7 @@ def diagnose(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
-    between: Between = ALWAYS,
+    between: Between = None,
     json_out: JsonOut = None,
     html_out: HtmlOut = None,
 ) -> None:

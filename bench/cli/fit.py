@@ -37,7 +37,6 @@ from latticebench.bench.cli.reading import (
     read_told,
 )
 from latticebench.systems.errors import InputError
-from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.adequacy import Adequacy
@@ -73,7 +72,7 @@ def fit(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
-    between: Between = ALWAYS,
+    between: Between = None,
     json_out: JsonOut = None,
     html_out: HtmlOut = None,
 ) -> None:

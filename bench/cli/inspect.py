@@ -19,7 +19,6 @@ from latticebench.bench.cli.reading import (
     Turn,
     layout_of,
 )
-from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.inspection import Inspection
@@ -44,7 +43,7 @@ def inspect(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
-    between: Between = ALWAYS,
+    between: Between = None,
     json_out: JsonOut = None,
     out: Annotated[
         Path | None,

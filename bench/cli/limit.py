@@ -35,7 +35,6 @@ from latticebench.bench.cli.reading import (
     read_told,
 )
 from latticebench.systems.errors import InputError
-from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.bounds import BoundOf
@@ -88,7 +87,7 @@ def limit(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
-    between: Between = ALWAYS,
+    between: Between = None,
     json_out: JsonOut = None,
     yes: Yes = False,
 ) -> None:

@@ -22,7 +22,6 @@ from latticebench.bench.cli.reading import (
 )
 from latticebench.systems.errors import InputError, unknown
 from latticebench.systems.files import shown
-from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.bench.overlay import Overlay
@@ -55,7 +54,7 @@ def plot(
     time_scale: TimeScale = "1",
     sort: Sort = False,
     turn: Turn = 0.0,
-    between: Between = ALWAYS,
+    between: Between = None,
 ) -> None:
     """Draw a recording, or a fit or a diagnosis on top of its readings: maps, lines, residual, spectra, portraits."""
     from latticebench.bench.animation import FILMS, check_film

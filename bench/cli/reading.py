@@ -11,7 +11,6 @@ import typer
 
 from latticebench.bench.cli.options import AnyEnds, named, place
 from latticebench.systems.errors import printable
-from latticebench.systems.layout import ALWAYS
 
 if TYPE_CHECKING:
     from latticebench.systems.layout import Layout
@@ -69,7 +68,7 @@ TimeScale = Annotated[
     ),
 ]  # fmt: skip
 Between = Annotated[
-    tuple[float, float],
+    tuple[float, float] | None,
     typer.Option(
         "--between", metavar="TIME TIME", rich_help_panel=PANEL, show_default=False,
         help="Read no other times than these, in the unit of the file; inf for the last one leaves out the beginning "
@@ -85,16 +84,16 @@ def layout_of(
     sort: bool = False,
     turn: float = 0.0,
     time_scale: str = "1",
-    between: tuple[float, float] = ALWAYS,
+    between: tuple[float, float] | None = None,
 ) -> Layout:
     """Return the layout that the options describe.
 
     Raises:
         InputError: a scale is neither a number nor a unit, the turn is none, or no time is to be read.
     """
-    from latticebench.systems.layout import Layout
+    from latticebench.systems.layout import ALWAYS, Layout
 
-    layout = Layout(time, tuple(columns or ()), scale, sort, turn, time_scale, between)
+    layout = Layout(time, tuple(columns or ()), scale, sort, turn, time_scale, between or ALWAYS)
     _ = layout.factor, layout.period, layout.time_factor, layout.stretch
     return layout
 

@@ -194,10 +194,14 @@ def test_a_model_without_a_force_is_named_if_it_forecasts_better_by_more_than_it
     monkeypatch.setattr(repair, "Worth", lambda *_: SimpleNamespace(value=lambda one: behind if one is plain else 0.0))
     monkeypatch.setattr(repair, "compared", lambda _, fitted: SimpleNamespace(fitted=fitted))
     search = SimpleNamespace(problem=SimpleNamespace(finest=0.0), say=lambda _: None)
-    found = repair._plainer(search, driven, [driven, plain], lambda one: forecasts[id(one)])
+
+    def foreseen(one, _):
+        return forecasts[id(one)]
+
+    found = repair._plainer(search, driven, [driven, plain], foreseen)
     assert (found is not None and found.fitted is plain) == named
-    assert repair._plainer(search, plain, [driven, plain], lambda one: forecasts[id(one)]) is None
-    assert repair._plainer(search, driven, [driven], lambda one: forecasts[id(one)]) is None
+    assert repair._plainer(search, plain, [driven, plain], foreseen) is None
+    assert repair._plainer(search, driven, [driven], foreseen) is None
 
 
 def test_a_right_forecast_is_as_wrong_as_the_noise_alone_makes_it():
