@@ -71,7 +71,10 @@ def test_a_spring_that_slips_is_named_with_its_time():
 def test_a_frequency_that_moves_with_the_size_of_the_swings_is_no_drift(loss):
     linear = library("linear", "u[n]")
     found = diagnose(linear, 2, [read(lambda *y: duffing(*y, loss=loss), [0.5, 0.0])], CATALOGUE)
-    assert {one.name for one in found.findings} == {"onsite-cubic"} | ({"damping"} if loss else set())
+    names = {one.name for one in found.findings}
+    # Of swings that are all alike, a sensor that saturates may say the same.
+    assert names == {"onsite-cubic", "damping"} if loss else names <= {"onsite-cubic", "sensor-saturation"}
+    assert found.verdict == "explained"
 
 
 def test_every_declared_coefficient_may_change_and_that_of_a_linear_force():
