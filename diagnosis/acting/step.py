@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.jump import Rise
 from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Placed, Scene
 from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
 from latticebench.diagnosis.acting.ramp import changing
+from latticebench.diagnosis.acting.sudden import Rise, Sudden
 from latticebench.systems.effects import Effect
 
 # The width of a step over the shortest time in which the motion changes by a radian: what moves has no time to notice
@@ -20,23 +19,14 @@ SHARP = 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Step(Placed, acts="step"):
+class Step(Sudden, acts="step"):
     """A term times strength * (1 + tanh((t - at) / width)) / 2: a spring that slips, a screw that comes loose.
 
     Attributes:
         text: the term.
-        at, width: in the unit of time.
-        least: the width below which it is taken as sharp, in the unit of time.
-        seen: the first and the last time of all recordings, between which it happens.
     """
 
     text: str
-    at: float
-    width: float
-    least: float
-    seen: tuple[float, float]
-    shape: ClassVar[tuple[str, ...]] = ("at", "width")
-    timed: ClassVar[bool] = True
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
@@ -54,37 +44,13 @@ class Step(Placed, acts="step"):
         """The effect and its term."""
         return (self.effect.name, self.text)
 
-    @property
-    def near(self) -> tuple[object, ...]:
-        """The effect, its term and its time, to a width."""
-        return (*self.place, f"{self.at / self._wide:.0f}")
-
-    @property
-    def possible(self) -> bool:
-        """Whether it happens between the first and the last time: before and after it is another coefficient."""
-        return self.seen[0] < self.at < self.seen[1]
-
-    @property
-    def moot(self) -> tuple[str, ...]:
-        """The width of what is as sharp as can be."""
-        return ("width",) if abs(self.width) < self.least else ()
-
-    @property
-    def begins(self) -> float:
-        """When it happens."""
-        return self.at
-
-    @property
-    def _wide(self) -> float:
-        return float(np.hypot(self.width, self.least))
-
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the term with its factor."""
         return (f"step of {self.text}",)
 
     def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return the step and, for time and width, its derivatives by them."""
-        wide, value = self._wide, self.strength[0]
+        wide, value = self.wide, self.strength[0]
         found = [Force(self.text, value, {0: 1.0}, None, Rise(self.at, wide))]
         if value:
             by_width = value * self.width / wide**2

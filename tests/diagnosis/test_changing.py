@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.diagnosis.acting import WAYS
-from latticebench.diagnosis.acting.jump import Rise
+from latticebench.diagnosis.acting.sudden import Rise
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
 from latticebench.systems.effects import CATALOGUE
