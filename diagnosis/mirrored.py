@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.model import Model
@@ -20,26 +22,57 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-# Sensors are tried from the other side on chains of so many sites at most.
+# Single sensors are tried from the other side on chains of so many sites at most.
 MOST_TURNED = 3
+# Decimals by which the shares are told apart that equations leave: all but some sensors turned is the same as these.
+ALIKE = 9
 
 
 def mirrored(problem: Problem, start: Model) -> list[tuple[Model, Problem]]:
-    """Return the declared equation with one sensor that looks from the other side, and the states it then has.
+    """Return the declared equation with sensors that look from the other side, and the states it then has.
 
-    It does where neighbours would push each other away otherwise, or where the equation would leave more.
+    On a short chain single ones do where neighbours would push each other away otherwise, or where the equation would
+    leave more; on a longer one those that do so together, where with them the equation leaves much less.
     """
+    if problem.chain.sites > MOST_TURNED:
+        return _together(problem, start)
     found, left = [], regressed(problem)[1]
-    for one in _sensors(problem):
-        other = one.turned()
-        if other is not None and one.site is not None:
-            seen = turned(problem, one.site)
-            coefficients, still_left = regressed(seen)
-            model = replace(start, coefficients=coefficients)
-            likelier = still_left < left or repelling(problem, start)
-            if likelier and not repelling(problem, model):
-                found.append((model.with_effect(other), seen))
+    for site, other in _sensors(problem):
+        seen = turned(problem, site)
+        coefficients, still_left = regressed(seen)
+        model = replace(start, coefficients=coefficients)
+        likelier = still_left < left or repelling(problem, start)
+        if site != 0 and likelier and not repelling(problem, model):
+            found.append((model.with_effect(other), seen))
     return found
+
+
+def _together(problem: Problem, start: Model) -> list[tuple[Model, Problem]]:
+    """Return the declared equation with the sensors that, turned step by step, make it leave least.
+
+    A step turns one sensor, or all on one side of a bond. What they lead to is returned where it leaves much less
+    (`rules.EXCHANGED`); of two sets that leave the same it has fewer sensors.
+    """
+    sensors, sites = dict(_sensors(problem)), range(problem.chain.sites)
+    beside = (part for k in sites[2:-1] for part in (sites[:k], sites[k:]))
+    steps = list(map(frozenset, [*([site] for site in sites), *beside]))
+
+    def seen(chosen: Set[int]) -> Problem:
+        return functools.reduce(turned, chosen, problem)
+
+    chosen: frozenset[int] = frozenset()
+    first = least = regressed(problem)[1]
+    while True:
+        others = {chosen ^ step for step in steps if chosen ^ step <= sensors.keys()}
+        left = {other: (round(regressed(seen(other))[1], ALIKE), len(other)) for other in others}
+        best = min(others, key=lambda other: left[other], default=chosen)
+        if best == chosen or not left[best][0] < rules.OTHERWISE * least:
+            break
+        chosen, least = best, left[best][0]
+    if not least < rules.EXCHANGED * first:
+        return []
+    model = replace(start, coefficients=regressed(seen(chosen))[0])
+    return [(functools.reduce(Model.with_effect, (sensors[site] for site in sorted(chosen)), model), seen(chosen))]
 
 
 def images(problem: Problem, fitted: Fitted) -> Iterator[tuple[Model, list[Float[ndarray, "pieces m state"]]]]:
@@ -52,10 +85,12 @@ def images(problem: Problem, fitted: Fitted) -> Iterator[tuple[Model, list[Float
         return
     sign = np.tile([1.0, -1.0], problem.chain.order)
     near = [nodes * sign for nodes in fitted.followed.nodes]
-    for plain, one in itertools.product(_attracting(problem, fitted.model), _sensors(problem)):
-        there = [k for k, placed in enumerate(plain.effects) if placed.place == one.place]
+    for plain, (site, turned_over) in itertools.product(_attracting(problem, fitted.model), _sensors(problem)):
+        if site == 0:
+            continue
+        there = [k for k, placed in enumerate(plain.effects) if placed.place == turned_over.place]
         rest = plain.without(there[0]) if there else plain
-        other = (plain.effects[there[0]] if there else one).turned()
+        other = plain.effects[there[0]].turned() if there else turned_over
         if other is not None:
             yield rest.with_effect(other), near
 
@@ -78,8 +113,7 @@ def _attracting(problem: Problem, model: Model) -> list[Model]:
     return []
 
 
-def _sensors(problem: Problem) -> list[Placed]:
-    """Return what can be said of single sensors' sign, all but the first one's."""
-    if problem.chain.sites > MOST_TURNED:
-        return []
-    return [one for one in problem.candidates if one.turned() is not None and one.site != 0]
+def _sensors(problem: Problem) -> list[tuple[int, Placed]]:
+    """Return the sites, and what says of each that its sensor looks from the other side."""
+    turned_over = ((one.site, one.turned()) for one in problem.candidates)
+    return [(site, other) for site, other in turned_over if site is not None and other is not None]

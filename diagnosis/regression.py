@@ -49,7 +49,7 @@ def sustained(problem: Problem) -> list[Model]:
     """
     waves: dict[tuple[object, ...], Placed] = {}
     for one in problem.candidates:
-        if one.frequency is not None and not one.instrument:
+        if one.frequency is not None and not (one.instrument or one.general):
             waves.setdefault(one.place, one)
     lines = [problem.spectrum.between(peak) for peak in problem.spectrum.peaks[:LINES]]
     offered = [one.tuned(line) for line in lines for one in waves.values()]

@@ -12,6 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from latticebench.diagnosis import modes, rules
+from latticebench.diagnosis.exchanged import exchanged
 from latticebench.diagnosis.finding import Compared, Finding, compared, findings
 from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.forecast import Prediction, ahead, by_noise, pooled, predict, unforeseen, up_to
@@ -66,6 +67,7 @@ class Diagnosis:
         data: recordings as they were used.
         dead: sites whose sensors always read the same, which were not used.
         held: what was left out of recordings in which nothing moves at first or at last.
+        exchanged: the order of the columns, from 0, in which the declared equation leaves much less; () where none is.
         used: sample times that were used, and those recorded but for the latter.
         noise: standard deviation of each sensor: u of site 1, ..., N, then v; NaN where nothing was read. It is what
             the last model leaves; where something is left in that, no more than the readings alone show.
@@ -102,6 +104,7 @@ class Diagnosis:
     inputs: str = ""
     dead: tuple[int, ...] = ()
     held: tuple[Held, ...] = ()
+    exchanged: tuple[int, ...] = ()
     truth: Float[ndarray, " terms"] | None = None
 
     def against(self, truth: Float[ndarray, " terms"] | None) -> Diagnosis:
@@ -226,6 +229,8 @@ def _problem(
 ) -> tuple[Problem, tuple[int, ...]]:
     """Return the problem without the readings of sensors that do not work, and the sites of these.
 
+    Columns that look exchanged are told to the log at once.
+
     Raises:
         InputError: there are too few readings, or there is too little memory.
     """
@@ -237,6 +242,9 @@ def _problem(
     _check_outer(problem)
     _check_enough(problem)
     _check_room(problem)
+    if other := exchanged(problem):
+        columns = ", ".join(f"u{site + 1}" for site in other)
+        log.warning("%s: with columns in the order %s the equation leaves much less", data[0].source, columns)
     return problem, dead
 
 
@@ -397,7 +405,7 @@ def _diagnosis(
         criterion=(0.0, more * float(np.log(after.layout.readings())) - gain),
         declared=both(lambda one: np.array(one.model.coefficients[:count])),
         modes=(modes.of_recording(problem), modes.of_model(before), modes.of_model(after)),
-        inputs=in_words(problem), dead=dead, held=problem.held,
+        inputs=in_words(problem), dead=dead, held=problem.held, exchanged=exchanged(problem),
     )  # fmt: skip
 
 

@@ -55,6 +55,11 @@ FIRST_HORIZON = 0.5
 # A sensor's rate of change counts there if it swings by at least this share of what the liveliest one does: smoothed
 # noise of a sensor at rest changes fast.
 MOVES = 0.1
+# Columns may be in another order than the sites, and sensors of longer chains look from the other side, where so the
+# declared equation leaves less than this share of what it leaves otherwise, in the work of forces. In the right order
+# of recordings as of the suite `laboratory`, whatever they lack, no other one leaves less at all. One more exchange, or
+# sensor, is worth it if it leaves less than the second share.
+EXCHANGED, OTHERWISE = 0.5, 0.9
 # Where the declared equation leaves less than so many times the noise of whole recordings, the search begins there:
 # what is missing is weak, and short horizons would only offer stand-ins.
 AT_ONCE = 1.5

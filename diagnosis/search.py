@@ -471,7 +471,9 @@ class Search:
         tangent, own = self.tangent(fitted), Worth(self.problem, fitted)
         if timed:
             past = past_of(self.problem, fitted.layout, fitted.model, fitted.followed.nodes)
-            courses = [one.with_past(past) for one in self.open if one.timed and one.wandering() is None]
+            courses = [
+                one.with_past(past) for one in self.open if one.timed and not one.general and one.wandering() is None
+            ]
             absent += most_promising(tangent, courses, self.problem.price_of, lambda one: one.effect.name)
         best: dict[tuple[object, ...], tuple[float, Scored]] = {}
         tried: dict[str, Tried] = {}

@@ -27,13 +27,21 @@ def in_place(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ..
     """Yield the numbers of effects of a model that swing together, with the candidate that does most of what they do.
 
     These are any two, and any one where forces push harder than all else. Frequencies are one where they differ by less
-    than half of what the longest recording resolves.
+    than half of what the longest recording resolves. Besides, each may have a more general case (`Placed.general`).
     """
     effects = tangent.fitted.model.effects
     swinging = [k for k, one in enumerate(effects) if one.frequency is not None]
+    for k in swinging:
+        alike = [one for one in problem.candidates if one.general and one.effect is effects[k].effect]
+        others = [one.tuned(float(effects[k].frequency or 0.0)) for one in alike if one.place != effects[k].place]
+        without = tangent.in_place_of([k])
+        best = max(without.scored(others), key=lambda one: one.won, default=None)
+        if best is not None and best.won > without.taken:
+            yield (k,), best.placed
     alone = [(k,) for k in swinging] if pushed(tangent.fitted) > HARD else []
     # One of each kind and place; all are tuned to the same frequency.
-    places = {one.place: one for one in problem.candidates if one.frequency is not None} if swinging else {}
+    waves = (one for one in problem.candidates if one.frequency is not None and not one.general)
+    places = {one.place: one for one in waves} if swinging else {}
     for some in (*alone, *itertools.combinations(swinging, 2)):
         omega = [float(effects[k].frequency or 0.0) for k in some]
         # One of two may do the work of both.

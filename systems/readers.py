@@ -28,6 +28,7 @@ from latticebench.systems.ordering import averaged, in_order, unwrapped
 from latticebench.systems.samples import Origin, Samples, check_alike, check_units
 from latticebench.systems.stencil import Ends
 from latticebench.systems.tables import DASHES, Table, check_count, named_once, read_csv, read_sheet
+from latticebench.systems.timing import evened
 
 if TYPE_CHECKING:
     import pandas
@@ -172,6 +173,8 @@ def _samples(arrays: Arrays, told: _Told) -> Samples:
     t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
     assert t is not None
     assert u is not None
+    t, notes = evened(t)
+    origin = origin.noting(*notes)
     if origin.scale != 1:
         u, v = u * origin.scale, None if v is None else v * origin.scale
     if pace != 1:

@@ -185,6 +185,8 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
             f"{', '.join(dead[:NAMED])}{more}: always the same reading, which is taken for a sensor that does not "
             "work; what it reads was left out, and its site moves as the equation says."
         )
+    if diagnosis.exchanged:
+        yield f"{in_order(diagnosis.data[0], diagnosis.exchanged)}."
     for held in diagnosis.held:
         yield resting_at(held)
     for samples in _joined(diagnosis.data):
@@ -202,6 +204,13 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
         )
     if diagnosis.inputs:
         yield f"Between its samples the measured input was taken as {diagnosis.inputs}, which the readings suit best."
+
+
+def in_order(samples: Samples, order: Sequence[int]) -> str:
+    """Return in which order of the columns an equation leaves much less, and what reads them so."""
+    names = [samples.columns([site]) for site in order]
+    line = f"{samples.source}: the declared equation leaves much less with the columns in the order {', '.join(names)}"
+    return f"{line}; if they are mixed up, {option('columns', ','.join(names))} reads them so"
 
 
 def resting_at(held: Held) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 MOST_LINES = 10
 # Characters between two columns of a table, and those that a column of names keeps where there is little room.
 GAP, NARROW = 3, 16
+# Seconds between two lines of a log that say what is being done.
+LINE_EVERY = 20.0
 MEANINGS = {"e2": "relative error of the coefficients, median over seeds"}
 SPREAD_MEANS = "; [10 %, 90 %] of n seeds, of at most five the least and the largest"
 
@@ -203,9 +206,12 @@ def waiting(text: str) -> Iterator[None]:
 
 @contextmanager
 def watching() -> Iterator[Callable[[str], None]]:
-    """Show on standard error what is being done and for how long, on a terminal; the function takes the text."""
+    """Show on standard error what is being done and for how long; the function takes the text.
+
+    A terminal shows a bar that moves; a log gets a line now and then, and none of what is done before the first.
+    """
     if not sys.stderr.isatty():
-        yield lambda _: None
+        yield _now_and_then(time.monotonic())
         return
     from rich.console import Console
     from rich.markup import escape
@@ -216,6 +222,21 @@ def watching() -> Iterator[Callable[[str], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("starting", total=None)
         yield lambda text: progress.update(task, description=escape(text))
+
+
+def _now_and_then(start: float) -> Callable[[str], None]:
+    """Return what writes a text to standard error if the last one, or the start, was `LINE_EVERY` seconds ago."""
+    last = start
+
+    def tell(text: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= LINE_EVERY:
+            last = now
+            sys.stderr.write(f"after {now - start:.0f} s: {printable(text)}\n")
+            sys.stderr.flush()
+
+    return tell
 
 
 @contextmanager

@@ -66,7 +66,7 @@ class Swinging(Placed):
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return cosine and sine of each term."""
         waves = (f"{name}({self.omega:.6g}*{since(self.middle)})" for name in ("cos", "sin"))
-        return tuple(wave if text == "1" else f"{wave}*{text}" for wave in waves for text in self.texts)
+        return tuple(wave if text == "1" else f"{wave}*{_factor(text)}" for wave in waves for text in self.texts)
 
     @property
     def near(self) -> tuple[object, ...]:
@@ -121,11 +121,17 @@ class Harmonic(Swinging, acts="harmonic"):
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return every frequency of the scene."""
+        """Return every frequency of the scene; besides, what acts through the field does so through declared terms."""
         texts = scene.terms(effect)
         for omega in scene.frequencies if texts else ():
             still = (0.0,) * (2 * len(texts))
             yield cls(effect=effect, texts=texts, omega=float(omega), middle=scene.middle, strength=still)
+        if any(Term(text).names & {"u", "v"} for text in texts) and len(scene.frequencies):
+            # It is tuned to the frequency of what it stands in for.
+            any_ = float(scene.frequencies[0])
+            for text in scene.texts:
+                if text not in texts:
+                    yield Modulated(effect=effect, texts=(text,), omega=any_, middle=scene.middle, strength=(0.0, 0.0))
 
     def forces(self, chain: Chain) -> list[Force]:
         """Return the waves and, for the frequency, their derivatives by it."""
@@ -141,3 +147,20 @@ class Harmonic(Swinging, acts="harmonic"):
         phase = sympy.Float(self.omega, 6) * since_then
         bodies = [wave(phase) * Term(text).in_decimals for wave in (sympy.cos, sympy.sin) for text in self.texts]
         return [Summand(*one) for one in zip(self.labels(chain), self.strength, bodies, strict=True)]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Modulated(Harmonic):
+    """A declared term whose coefficient swings."""
+
+    general: ClassVar[bool] = True
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect and its term."""
+        return (self.effect.name, *self.texts)
+
+
+def _factor(text: str) -> str:
+    """Return a term as one that is multiplied: a sum in brackets."""
+    return f"({text})" if "+" in text or "-" in text else text

@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from latticebench.diagnosis.mirrored import mirrored
+from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.problem import Problem
+from latticebench.diagnosis.regression import regressed
 from latticebench.diagnosis.repair import diagnose
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.lattice import library
@@ -17,6 +21,7 @@ from latticebench.systems.samples import Samples
 CARTS = Path(__file__).parents[3] / "shared" / "data" / "measured" / "carts.csv"
 OMEGA, FRICTION, SWING, NOISE = 3.0, 0.35, 1.0, 0.005
 STIFF, SOFT = 9.0, 3.0
+COUPLING = "u[n+1]+u[n-1]-2*u[n]"
 
 
 def rubbing(t):
@@ -85,3 +90,33 @@ def test_carts_that_come_to_rest_are_damped_and_not_driven():
     assert "parametric-drive" in others
     assert ahead < 0
     assert any(one.name == "parametric-drive" for one in found.horizons[-1].tried)
+
+
+def five_beads(turned=()):
+    """Five beads on a string, with noise; some sensors look from the other side."""
+    sites, t = 5, np.linspace(0, 12, 400)
+    between = 2 * np.eye(sites) - np.eye(sites, k=1) - np.eye(sites, k=-1)
+    squares, shapes = np.linalg.eigh(3 * between)
+    begins = shapes.T @ np.array([0.5, 0.0, 0.2, 0.0, -0.1])
+    u = (np.cos(np.sqrt(squares) * t[:, None]) * begins) @ shapes.T
+    u[:, list(turned)] *= -1
+    return Samples(t, u + 0.003 * np.random.default_rng(2).normal(size=u.shape), source="beads", ends="fixed")
+
+
+@pytest.mark.parametrize("turned", [(0,), (2,), (1, 3), (3, 4), (0, 1)])
+def test_on_a_longer_chain_sensors_that_look_from_the_other_side_are_found_before_the_search(turned):
+    chain = library("chain", COUPLING)
+    problem = Problem.of(chain, 2, [five_beads(turned)], CATALOGUE)
+    ((model, seen),) = mirrored(problem, Model(chain, 2, regressed(problem)[0]))
+    assert {one.site for one in model.effects} == set(turned)
+    assert all(one.effect.name == "sensor-gain" and one.strength == (-2.0,) for one in model.effects)
+    assert model.coefficients == pytest.approx([3], rel=0.02)
+    straight = Problem.of(chain, 2, [five_beads()], CATALOGUE)
+    np.testing.assert_allclose(seen.nodes[0][:, :5], straight.nodes[0][:, :5], atol=0.02)
+    assert mirrored(straight, Model(chain, 2, regressed(straight)[0])) == []
+
+
+def test_a_sensor_in_the_middle_of_a_longer_chain_that_looks_from_the_other_side_is_all_that_is_named():
+    found = diagnose(library("chain", COUPLING), 2, [five_beads((2,))], CATALOGUE)
+    assert [(one.name, one.site) for one in found.findings] == [("sensor-gain", 2)]
+    assert found.verdict == "explained"

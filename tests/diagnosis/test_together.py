@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.integrate import solve_ivp
 
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
 from latticebench.diagnosis.score import Tangent
 from latticebench.diagnosis.together import in_place
-from latticebench.systems.effects import find
+from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.lattice import library
 from latticebench.systems.samples import Samples
 
@@ -49,3 +50,23 @@ def test_a_force_at_one_site_and_one_at_all_give_way_to_the_hum_of_a_sensor():
     assert np.linalg.norm(one.strength) < 0.1
     (alone,) = diagnose(DECLARED, 2, [data], [*forces, find("sensor-hum")]).findings
     assert (alone.name, alone.site) == ("sensor-hum", 1)
+
+
+def test_where_the_length_of_a_pendulum_swings_the_sine_is_what_swings():
+    pump = 6.7
+    t = np.arange(0, 40, 1 / 25)
+
+    def rate(t, y):
+        return [y[1], -(12 + np.cos(pump * t + 0.3)) * np.sin(y[0]) - 0.03 * y[1]]
+
+    u = solve_ivp(rate, t[[0, -1]], [0.9, 0.0], t_eval=t, rtol=1e-10, atol=1e-11).y[:1].T
+    data = Samples(t, u + 0.003 * np.random.default_rng(6).normal(size=u.shape), source="swing", ends="fixed")
+    found = diagnose(library("pendulum", "sin(u[n])"), 2, [data], CATALOGUE)
+    effects = {one.name: one for one in found.findings}
+    assert (found.verdict, set(effects)) == ("explained", {"parametric-drive", "damping"})
+    values = effects["parametric-drive"].values
+    waves = {label: value for label, value in values.items() if label.endswith("*sin(u[n])")}
+    assert len(waves) == 2
+    size = np.hypot(*(value for value, _ in waves.values()))
+    assert abs(size - 1) < 4 * max(error for _, error in waves.values())
+    assert abs(values["omega"][0] - pump) < 4 * values["omega"][1]

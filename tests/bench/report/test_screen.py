@@ -34,3 +34,14 @@ def test_a_table_that_is_too_wide_is_printed_in_parts_with_whole_numbers(
 def test_a_table_that_fits_is_one(monkeypatch: pytest.MonkeyPatch, keys: int) -> None:
     text = printed(monkeypatch, 200, keys)
     assert (text.count("library"), "  ".join(CELLS[0]).split()) == (1, text.splitlines()[3].split())
+
+
+def test_a_log_is_told_now_and_then_what_is_being_done(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter([0.0, 3.0, 21.0, 30.0, 65.5])
+    monkeypatch.setattr(screen.time, "monotonic", lambda: next(clock))
+    with screen.watching() as tell:
+        for text in ("first", "second", "third", "fourth"):
+            tell(text)
+    assert capsys.readouterr().err == "after 21 s: second\nafter 66 s: fourth\n"
