@@ -47,6 +47,7 @@ OFF: Mapping[str, Any] = {
     "AT_ONCE": NEVER, "FASTER": rules.GROWTH, "ALMOST": 1.0, "BORDER": 1e6, "LOST": ALWAYS, "FOLLOWED": NEVER,
     "SHARE": NEVER, "SHARE_TIMED": NEVER, "REPELLING": NEVER, "DISPLACED": NEVER, "PLAINER": NEVER, "LEANER": NEVER,
     "PUSHED": NEVER, "IN_COMMON": ALWAYS, "BESIDE_WHITE": ALWAYS, "WORSE": ALWAYS, "BEYOND_NOISE": NEVER,
+    "HELD": ALWAYS, "AWAY": ALWAYS, "EXCHANGED": NEVER, "OTHERWISE": NEVER,
 }  # fmt: skip
 # Numbers that only mean something as they are, or that are gone with another one.
 NEITHER = {"STAND_INS"}
@@ -63,6 +64,8 @@ KINDS_OF_RECORDINGS = {
     "as missing, or as nothing",
     "slow": "laboratory recordings of one to three sites with white and slow noise, every other one with nothing "
     "missing: as missing, or as nothing",
+    "held": "laboratory recordings of one to three sites that begin before the chain is let go, every other one with "
+    "nothing missing: as missing, or as nothing",
     "unnamed": "short recordings of 25 sites with an effect that has no name: the verdict says that something is left",
     "relaxing": "short recordings of a Ginzburg-Landau lattice of 25 sites, one effect missing: it alone is named",
     "measured": "measured recordings: the effects that are known to be there are named, and the forecast is not worse",
@@ -78,6 +81,7 @@ SEEDS = {
     "mains": range(39000, 39016),
     "shaken": range(42000, 42016),
     "slow": range(43000, 43016),
+    "held": range(55000, 55016),
 }
 SITES = (1, 2, 3)
 # What is missing where a sensor is bent, and where one has mains.
@@ -127,16 +131,12 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
     ]
     for kind, effects in (("bent", BENT), ("mains", MAINS)):
         found += [(kind, str(seed), Laboratory(seed=seed, sites=2, effects=effects)) for seed in SEEDS[kind]]
-    found += [
-        ("shaken", str(seed), Laboratory(seed=seed, sites=SITES[1 + place // 2 % 2], instrument="shaken",
+    for kind, few in (("shaken", SITES[1:]), ("slow", SITES), ("held", SITES)):
+        found += [
+            (kind, str(seed), Laboratory(seed=seed, sites=few[place // 2 % len(few)], instrument=kind,
                                          effects="none" if place % 2 else "any"))
-        for place, seed in enumerate(SEEDS["shaken"])
-    ]  # fmt: skip
-    found += [
-        ("slow", str(seed), Laboratory(seed=seed, sites=SITES[place // 2 % len(SITES)], instrument="slow",
-                                       effects="none" if place % 2 else "any"))
-        for place, seed in enumerate(SEEDS["slow"])
-    ]  # fmt: skip
+            for place, seed in enumerate(SEEDS[kind])
+        ]  # fmt: skip
     for seed in SEEDS["unnamed"]:
         trials = [(name, Trial(system="phi4", effect=name, z=30.0, seed=seed)) for name in [*FIFTH_BLIND][::EVERY]]
         found += [("unnamed", f"{name} {seed}", trial) for name, trial in trials]
@@ -152,9 +152,9 @@ def recordings(folder: Path | None) -> list[tuple[str, str, Case]]:
 
 def judged(kind: str, name: str, result: Mapping[str, Any]) -> dict[str, Any]:
     """Return the verdict, what was named, and whether that is right."""
-    if kind in ("missing", "nothing", "wandering", "bent", "mains", "shaken", "slow"):
+    if kind in ("missing", "nothing", "wandering", "bent", "mains", "shaken", "slow", "held"):
         row = laboratory.table([result]).iloc[0]
-        right = row["right"] and not (kind in ("nothing", "shaken", "slow") and row["verdict"] == "unexplained")
+        right = row["right"] and not (kind in ("nothing", "shaken", "slow", "held") and row["verdict"] == "unexplained")
         return {"truth": row["truth"], "verdict": row["verdict"], "named": row["named"], "right": right}
     if kind in ("unnamed", "relaxing"):
         row = scores.table([result]).iloc[0]
