@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from latticebench.diagnosis.acting.one_site import alike
 from latticebench.diagnosis.acting.placed import Chain, Force, Placed, Scene
 from latticebench.systems.effects import Effect
 
@@ -28,13 +29,15 @@ class EverySite(Placed, acts="every site"):
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return the one place, on a chain of at least three sites: with fewer, one site can be named."""
+        """Return the formula and its like, on a chain of at least three sites: with fewer, one site can be named."""
         texts, chain = scene.terms(effect), scene.chain
         if texts and len(chain.moving) > 2 and len(chain.moving) == chain.sites:
             whole = not set(texts) <= set(scene.texts)
             yield cls(
                 effect=effect, texts=texts, whole=whole, strength=(0.0,) * ((chain.sites - (not whole)) * len(texts))
             )
+            for text in alike(texts, scene):
+                yield OtherCoefficients(effect=effect, texts=(text,), whole=False, strength=(0.0,) * (chain.sites - 1))
 
     def labels(self, chain: Chain) -> tuple[str, ...]:
         """Return the terms with their sites."""
@@ -60,3 +63,15 @@ class EverySite(Placed, acts="every site"):
                 f"deviations from their mean, which belongs to {named} itself; standard deviation {np.std(each):.3g}"
             )
         return [f"every site has {named} besides, with a coefficient of its own: {about}"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OtherCoefficients(EverySite):
+    """A declared term that has a coefficient of its own at each site."""
+
+    general: ClassVar[bool] = True
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect and its term."""
+        return (self.effect.name, *self.texts)

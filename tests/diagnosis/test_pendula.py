@@ -67,3 +67,21 @@ def test_a_motion_far_from_its_zero_costs_nats_as_cauchys_prior_has_it(away):
     mean = np.mean(u, axis=0)
     distances = [np.sqrt(np.mean((mean + shift) ** 2)) / swing for shift in (away, 0.0)]
     assert displaced(found) == pytest.approx(np.log1p(max(distances[0] - distances[1], 0.0) ** 2), rel=1e-3, abs=1e-6)
+
+
+def test_a_pendulum_of_another_length_has_another_sine_not_a_spring_beside_it():
+    t, gravity = np.linspace(0, 30, 900), np.array([9.0, 9.0, 9.6])
+
+    def rate(t, y):
+        u, v = np.split(y, 2)
+        beyond = np.concatenate([u[:1], u, u[-1:]])
+        return np.concatenate([v, 1.1 * np.diff(beyond, 2) - gravity * np.sin(u)])
+
+    u = solve_ivp(rate, t[[0, -1]], [0.9, 0.0, -0.5, 0, 0, 0], t_eval=t, rtol=1e-10, atol=1e-11).y[:3].T
+    data = Samples(t, u + 0.003 * np.random.default_rng(8).normal(size=u.shape), source="three", ends="free")
+    found = diagnose(library("pendula", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])"), 2, [data], CATALOGUE)
+    ((defect),) = found.findings
+    assert (found.verdict, defect.name, defect.site) == ("explained", "defect", 2)
+    ((label, (value, error)),) = defect.values.items()
+    assert label == "sin(u[n])"
+    assert value == pytest.approx(-0.6, abs=4 * error)
