@@ -130,6 +130,10 @@ class Problem:
         chain = Chain(first.sites, order, first.is_complex, levels, first.ends, moving, widest)
         step = float(np.median(np.diff(longest.t)))
         span = float(longest.t[-1] - longest.t[0])
+        nodes = tuple(plain.pack(*both) for both in states)
+        own = plain.parts * plain.count
+        if _relaxes(spectrum, span, order):
+            top = max([top, *(_rate(one[:, :own], samples.t) for one, samples in zip(nodes, data, strict=True))])
         past = tuple(
             course(one.t, split_parts(field[0], first.is_complex)) for one, field in zip(data, states, strict=True)
         )
@@ -149,7 +153,6 @@ class Problem:
             step,
         )
         candidates = tuple(one for effect in catalogue for one in way_of(effect).places(effect, scene))
-        nodes = tuple(plain.pack(*both) for both in states)
         return cls(
             declared, order, data, chain, plain, records, nodes, splines, spectrum, step, scene, candidates,
             forced, held=held,
@@ -178,20 +181,20 @@ class Problem:
         """The highest angular frequency that the readings plainly show."""
         return _top(self.spectrum, max(self.data, key=lambda one: len(one.t)))
 
+    @property
+    def relaxes(self) -> bool:
+        """Whether the lattice relaxes instead of swinging: no period tells what acts at a time of its own."""
+        return _relaxes(self.spectrum, self.scene.span, self.order)
+
     @functools.cached_property
     def fastest(self) -> float:
         """The highest angular frequency, or a faster rate of change: what relaxes has no peak in the spectrum.
 
-        The rate of a sensor is the root mean square of its slope over its standard deviation, about the frequency of a
-        sine; sensors that move little are left out.
+        The rate is that of the sensor that changes fastest (`_rate`).
         """
-        found = self.top
-        for record, nodes in zip(self.records, self.nodes, strict=True):
-            u = nodes[:, : self.plain.parts * self.plain.count]
-            size, slope = np.nanstd(u, axis=0), np.sqrt(np.nanmean(np.gradient(u, record.times, axis=0) ** 2, axis=0))
-            moving = size > rules.MOVES * np.nanmax(size)
-            found = max(found, float(np.max(slope[moving] / size[moving], initial=0.0)))
-        return found
+        own = self.plain.parts * self.plain.count
+        pairs = zip(self.records, self.nodes, strict=True)
+        return max([self.top, *(_rate(nodes[:, :own], record.times) for record, nodes in pairs)])
 
     @property
     def main(self) -> float:
@@ -290,6 +293,22 @@ def _check_gaps(data: Sequence[Samples]) -> None:
                 f"{one.source}: rows {row + 1} and {row + 2}: {gap:g} between two readings, where {usual:g} is usual; "
                 "cut the recording there into trajectories, or give all times in one unit"
             )
+
+
+def _relaxes(spectrum: Spectrum, span: float, order: int) -> bool:
+    """Return whether a lattice of first order has no peak in its spectrum but for less than a wave in the recording."""
+    return order == 1 and not np.any(spectrum.peaks * span > 2 * np.pi)
+
+
+def _rate(u: Float[ndarray, "time sensors"], t: Float[ndarray, " time"]) -> float:
+    """Return the rate of change of the sensor that changes fastest; 0 where none moves.
+
+    It is the root mean square of its slope over its standard deviation, about the angular frequency of a sine; sensors
+    that move little are left out.
+    """
+    size, slope = np.nanstd(u, axis=0), np.sqrt(np.nanmean(np.gradient(u, t, axis=0) ** 2, axis=0))
+    moving = size > rules.MOVES * np.nanmax(size)
+    return float(np.max(slope[moving] / size[moving], initial=0.0))
 
 
 def thinned(samples: Samples, top: float, fast: Float[ndarray, " lines"]) -> Samples:

@@ -87,7 +87,7 @@ class Search:
             waves = length * self.problem.step * self.problem.main / (2 * np.pi)
             strays = last is not None and misfits(self.problem, last.models[0], anywhere=True)
             long = whole or waves >= rules.PERIODS
-            late = long or stuck or strays
+            late = long or stuck or strays or self.problem.relaxes
             self.open = tuple(one for one in self.problem.candidates if (long if one.slow else late or not one.timed))
             before, fits = carried[0], list(carried[1:])
             if late and not opened:

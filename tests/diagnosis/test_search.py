@@ -171,3 +171,23 @@ def test_a_force_that_does_as_well_as_a_modulation_is_named_beside_it():
     recording = make_recording(90035, effects=("drive", "sensor-offset"), sites=1)
     found = diagnose(recording.declared, recording.order, [recording.samples], CATALOGUE)
     assert [one for one in found.findings if "drive" in (one.name, *one.alternatives)]
+
+
+def test_a_heater_that_is_on_for_a_while_is_named_though_temperatures_relax():
+    t, at, width = np.arange(0, 400, 1.0), 120.0, 25.0
+
+    def rate(t, u):
+        beyond = np.concatenate([u[:1], u, u[-1:]])
+        heat = 0.5 * np.exp(-(((t - at) / width) ** 2) / 2) * np.eye(5)[1]
+        return 0.02 * np.diff(beyond, 2) - 0.002 * u + heat
+
+    u = solve_ivp(rate, t[[0, -1]], [30.0, 10.0, 0.0, 5.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-9).y.T
+    read = u + [0.5, -0.2, 0.3, -0.1, 0.2] + 0.05 * np.random.default_rng(5).normal(size=u.shape)
+    data = Samples(t, read, source="rod", ends="free")
+    found = diagnose(library("rod", "u[n+1]+u[n-1]-2*u[n]"), 1, [data], CATALOGUE)
+    effects = {one.name: one for one in found.findings}
+    assert (found.verdict, set(effects)) == ("explained", {"sensor-offset", "damping", "local-kick"})
+    assert effects["local-kick"].site == 1
+    for name, true in (("at", at), ("width", width)):
+        value, error = effects["local-kick"].values[name]
+        assert value == pytest.approx(true, abs=4 * error)
