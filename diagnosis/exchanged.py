@@ -20,20 +20,22 @@ from latticebench.systems.samples import Samples, SimulatedSamples
 if TYPE_CHECKING:
     from numpy import ndarray
 
-# Chains of so many sites at most are looked at, and all pairs of sites of so many at most; else neighbours.
-LONGEST, EVERY_PAIR = 24, 8
+# Chains of so many sites are looked at, and all pairs of sites of so many at most; else neighbours.
+SHORTEST, LONGEST, EVERY_PAIR = 3, 24, 8
 
 
 def exchanged(problem: Problem) -> tuple[int, ...]:
     """Return the order of the columns, from 0, in which the declared equation leaves much less; () where none is.
 
     Pairs are exchanged, the best first, as long as one leaves less. What is compared is the share of the forces' work
-    that the equation leaves of smoothed readings, with constant forces besides (see `regressed`).
+    that the equation leaves of smoothed readings, with constant forces besides (see `regressed`). Sites without an
+    equation keep their columns: else a bad sensor would be best where nothing is asked of it.
     """
-    sites = problem.chain.sites
-    if not 2 < sites <= LONGEST:
+    sites, moving = problem.chain.sites, problem.chain.moving
+    if not SHORTEST <= len(moving) <= LONGEST:
         return ()
-    pairs = [pair for pair in itertools.combinations(range(sites), 2) if sites <= EVERY_PAIR or pair[1] - pair[0] == 1]
+    near = len(moving) <= EVERY_PAIR
+    pairs = [pair for pair in itertools.combinations(moving, 2) if near or pair[1] - pair[0] == 1]
     order, whole = list(range(sites)), _fields(problem)
     first = least = _left(problem, whole, order)
     for _ in range(sites):
@@ -50,7 +52,7 @@ def exchanged(problem: Problem) -> tuple[int, ...]:
 def of_recordings(declared: Library, order: int, data: Sequence[Samples]) -> tuple[int, ...]:
     """Return the same of recordings; () where they cannot be looked at."""
     shown = [without_halves(one.observed() if isinstance(one, SimulatedSamples) else one) for one in data]
-    if not 2 < shown[0].sites <= LONGEST:
+    if not SHORTEST <= shown[0].sites <= LONGEST:
         return ()
     try:
         return exchanged(Problem.of(declared, order, shown, ()))
@@ -77,15 +79,7 @@ def _left(problem: Problem, whole: Sequence[ndarray], order: Sequence[int]) -> f
     """Return the share that the equation leaves where the columns are in another order; infinity where it is none."""
     fields = [one[..., list(order)] for one in whole]
     nodes = tuple(one[..., problem.plain.moving].reshape(len(one), -1) for one in fields)
-    splines = problem.splines
-    if len(problem.plain.border):
-        from scipy.interpolate import make_interp_spline
-
-        splines = tuple(
-            make_interp_spline(record.times, one[:, 0][..., problem.plain.border], k=3).c
-            for record, one in zip(problem.records, fields, strict=True)
-        )
     try:
-        return regressed(replace(problem, nodes=nodes, splines=splines))[1]
+        return regressed(replace(problem, nodes=nodes))[1]
     except InputError:
         return np.inf

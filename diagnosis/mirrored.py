@@ -17,6 +17,7 @@ from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.problem import Problem, turned
 from latticebench.diagnosis.regression import regressed
 from latticebench.diagnosis.worth import COUPLING, repelling
+from latticebench.systems.errors import InputError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 # Single sensors are tried from the other side on chains of so many sites at most.
 MOST_TURNED = 3
+# Chains of so many sites that have an equation, at most, are asked for several.
+LONGEST = 24
 # Decimals by which the shares are told apart that equations leave: all but some sensors turned is the same as these.
 ALIKE = 9
 
@@ -39,7 +42,7 @@ def mirrored(problem: Problem, start: Model) -> list[tuple[Model, Problem]]:
     found, left = [], regressed(problem)[1]
     for site, other in _sensors(problem):
         seen = turned(problem, site)
-        coefficients, still_left = regressed(seen)
+        coefficients, still_left = _carried(seen, start)
         model = replace(start, coefficients=coefficients)
         likelier = still_left < left or repelling(problem, start)
         if site != 0 and likelier and not repelling(problem, model):
@@ -53,9 +56,13 @@ def _together(problem: Problem, start: Model) -> list[tuple[Model, Problem]]:
     A step turns one sensor, or all on one side of a bond. What they lead to is returned where it leaves much less
     (`rules.EXCHANGED`); of two sets that leave the same it has fewer sensors.
     """
-    sensors, sites = dict(_sensors(problem)), range(problem.chain.sites)
+    moving = frozenset(problem.chain.moving)
+    if len(moving) > LONGEST:
+        return []
+    sensors = {site: one for site, one in _sensors(problem) if site in moving}
+    sites = range(problem.chain.sites)
     beside = (part for k in sites[2:-1] for part in (sites[:k], sites[k:]))
-    steps = list(map(frozenset, [*([site] for site in sites), *beside]))
+    steps = [moving.intersection(part) for part in (*([site] for site in sites), *beside)]
 
     def seen(chosen: Set[int]) -> Problem:
         return functools.reduce(turned, chosen, problem)
@@ -64,7 +71,7 @@ def _together(problem: Problem, start: Model) -> list[tuple[Model, Problem]]:
     first = least = regressed(problem)[1]
     while True:
         others = {chosen ^ step for step in steps if chosen ^ step <= sensors.keys()}
-        left = {other: (round(regressed(seen(other))[1], ALIKE), len(other)) for other in others}
+        left = {other: (round(_carried(seen(other), start)[1], ALIKE), len(other)) for other in others}
         best = min(others, key=lambda other: left[other], default=chosen)
         if best == chosen or not left[best][0] < rules.OTHERWISE * least:
             break
@@ -93,6 +100,14 @@ def images(problem: Problem, fitted: Fitted) -> Iterator[tuple[Model, list[Float
         other = plain.effects[there[0]].turned() if there else turned_over
         if other is not None:
             yield rest.with_effect(other), near
+
+
+def _carried(problem: Problem, start: Model) -> tuple[tuple[float, ...], float]:
+    """Return what `regressed` does; the start's coefficients, and infinity, where a declared term is not finite."""
+    try:
+        return regressed(problem)
+    except InputError:
+        return start.coefficients, np.inf
 
 
 def _attracting(problem: Problem, model: Model) -> list[Model]:

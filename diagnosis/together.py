@@ -34,9 +34,11 @@ def in_place(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ..
     for k in swinging:
         alike = [one for one in problem.candidates if one.general and one.effect is effects[k].effect]
         others = [one.tuned(float(effects[k].frequency or 0.0)) for one in alike if one.place != effects[k].place]
+        if not others:
+            continue
         without = tangent.in_place_of([k])
-        best = max(without.scored(others), key=lambda one: one.won, default=None)
-        if best is not None and best.won > without.taken:
+        best = max(without.scored(others), key=lambda one: one.won)
+        if best.won > without.taken:
             yield (k,), best.placed
     alone = [(k,) for k in swinging] if pushed(tangent.fitted) > HARD else []
     # One of each kind and place; all are tuned to the same frequency.

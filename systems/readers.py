@@ -173,13 +173,14 @@ def _samples(arrays: Arrays, told: _Told) -> Samples:
     t, u, v, f = (arrays[name] for name in ("t", "u", "v", "f"))
     assert t is not None
     assert u is not None
-    t, notes = evened(t)
-    origin = origin.noting(*notes)
     if origin.scale != 1:
         u, v = u * origin.scale, None if v is None else v * origin.scale
     if pace != 1:
         t, v = t * pace, None if v is None else v / pace
-    return _within(Samples(t, u, v, f, None, told.source, told.ends, origin), told.layout)
+    samples = _within(Samples(t, u, v, f, None, told.source, told.ends, origin), told.layout)
+    # In the unit of the file, whose decimals are asked for, and after rows are chosen by the times that it has.
+    t, notes = evened(samples.t / pace)
+    return replace(samples, t=t * pace, origin=samples.origin.noting(*notes)) if notes else samples
 
 
 def _within(samples: Samples, layout: Layout) -> Samples:

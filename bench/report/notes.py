@@ -210,6 +210,8 @@ def in_order(samples: Samples, order: Sequence[int]) -> str:
     """Return in which order of the columns an equation leaves much less, and what reads them so."""
     names = [samples.columns([site]) for site in order]
     line = f"{samples.source}: the declared equation leaves much less with the columns in the order {', '.join(names)}"
+    if samples.is_complex or samples.v is not None or samples.f is not None:
+        return f"{line}; if they are mixed up, so may be what else was read of these sites"
     return f"{line}; if they are mixed up, {option('columns', ','.join(names))} reads them so"
 
 

@@ -130,7 +130,7 @@ class Harmonic(Swinging, acts="harmonic"):
             # It is tuned to the frequency of what it stands in for.
             any_ = float(scene.frequencies[0])
             for text in scene.texts:
-                if text not in texts:
+                if text not in texts and Term(text).names & {"u", "v"}:
                     yield Modulated(effect=effect, texts=(text,), omega=any_, middle=scene.middle, strength=(0.0, 0.0))
 
     def forces(self, chain: Chain) -> list[Force]:

@@ -54,6 +54,6 @@ class OtherCoefficient(OneSite):
 
 def alike(texts: Sequence[str], scene: Scene) -> list[str]:
     """Return the declared terms of a site's own u, or v, as the given terms are."""
-    own = {frozenset(Term(text).names & {"u", "v"}) for text in texts}
+    own = {frozenset(Term(text).names & {"u", "v"}) for text in texts} - {frozenset()}
     declared = ((text, Term(text)) for text in scene.texts if text not in texts)
     return [text for text, term in declared if term.reach == (0, 0) and frozenset(term.names & {"u", "v"}) in own]

@@ -200,8 +200,9 @@ class Placed(ABC):
         slow: whether it is looked for on long horizons alone, whatever is seen on short ones.
         local: whether it acts at single sites, or at each differently.
         fed: whether it depends on the field at earlier times.
-        general: whether it is looked for only in the place of an effect of which it is the general case: with a number
-            for each bond it would take whatever is missing where there is hardly any noise.
+        general: whether it is looked for only in the place of another effect: as what that one is a special case of, or
+            at declared terms. With a number for each bond it would take whatever is missing where there is hardly any
+            noise.
         of_rate: whether what it makes of readings of u depends on v.
         separated_by: the measurement that tells this way of acting from others; nothing where none is known.
     """

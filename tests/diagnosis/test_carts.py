@@ -116,6 +116,14 @@ def test_on_a_longer_chain_sensors_that_look_from_the_other_side_are_found_befor
     assert mirrored(straight, Model(chain, 2, regressed(straight)[0])) == []
 
 
+def test_readings_that_a_term_cannot_take_from_the_other_side_do_no_harm():
+    u = five_beads().u + 2.0
+    data = Samples(np.linspace(0, 12, 400), u, source="above zero", ends="free")
+    rooted = library("rooted", f"{COUPLING}; u[n]; sqrt(u[n])")
+    problem = Problem.of(rooted, 2, [data], CATALOGUE)
+    assert mirrored(problem, Model(rooted, 2, regressed(problem)[0])) == []
+
+
 def test_a_sensor_in_the_middle_of_a_longer_chain_that_looks_from_the_other_side_is_all_that_is_named():
     found = diagnose(library("chain", COUPLING), 2, [five_beads((2,))], CATALOGUE)
     assert [(one.name, one.site) for one in found.findings] == [("sensor-gain", 2)]

@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.bench.calls import judged
+from latticebench.bench.report.notes import in_order as in_words
 from latticebench.bench.report.notes import notes
 from latticebench.diagnosis.exchanged import exchanged, of_recordings
 from latticebench.diagnosis.problem import Problem
@@ -42,8 +43,13 @@ def in_order(samples, order):
     return replace(samples, u=samples.u[:, list(order)])
 
 
-@pytest.mark.parametrize("ends", ["free", "unknown"])
-@pytest.mark.parametrize("order", [(0, 2, 1, 3, 4), (3, 1, 2, 0, 4), (1, 2, 0, 3, 4), (0, 1, 4, 2, 3)])
+@pytest.mark.parametrize(
+    ("order", "ends"),
+    [
+        ((0, 2, 1, 3, 4), "free"), ((3, 1, 2, 0, 4), "free"), ((1, 2, 0, 3, 4), "free"), ((0, 1, 4, 2, 3), "free"),
+        ((0, 2, 1, 3, 4), "unknown"), ((0, 3, 2, 1, 4), "unknown"),
+    ],
+)  # fmt: skip
 def test_the_order_is_found_that_puts_columns_back(order, ends):
     found = of_recordings(PENDULA, 2, [in_order(pendula(ends), order)])
     put_back = [order[k] for k in found]
@@ -54,6 +60,26 @@ def test_the_order_is_found_that_puts_columns_back(order, ends):
 def test_nothing_is_said_of_columns_in_order_nor_from_the_other_end(ends):
     for order in (range(SITES), reversed(range(SITES))):
         assert exchanged(Problem.of(PENDULA, 2, [in_order(pendula(ends), order)], ())) == ()
+
+
+@pytest.mark.parametrize("ends", ["free", "unknown"])
+@pytest.mark.parametrize("site", range(SITES))
+@pytest.mark.parametrize("fault", ["turned", "noise", "gain", "copy"])
+def test_a_bad_sensor_is_no_other_order(fault, site, ends):
+    found = pendula(ends)
+    column = found.u[:, site]
+    other = {
+        "turned": -column, "gain": 2.5 * column, "copy": found.u[:, (site + 1) % SITES],
+        "noise": 0.3 * np.random.default_rng(site).normal(size=column.shape),
+    }  # fmt: skip
+    u = found.u.copy()
+    u[:, site] = other[fault]
+    assert of_recordings(PENDULA, 2, [replace(found, u=u)]) == ()
+
+
+def test_where_more_than_u_was_read_no_option_is_said_to_put_all_in_order():
+    data = pendula()
+    assert "--columns" not in in_words(replace(data, v=data.u), (0, 2, 1, 3, 4))
 
 
 def test_a_diagnosis_and_a_fit_say_which_columns_look_exchanged(caplog):
