@@ -79,6 +79,7 @@ def candidate(problem, way):
     found = [one for one in problem.candidates if isinstance(one, WAYS[way]) and one.effect.acts == way]
     if way == "everywhere":
         return next(one for one in found if one.effect.name == "next-neighbour")
+    found = [one for one in found if not one.general] or found
     most = max(len(one.numbers) for one in found)
     widest = [one for one in found if len(one.numbers) == most]
     # At the middle delay, an end of the past falls on a stage of the integrator, where its derivative jumps.

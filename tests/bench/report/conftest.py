@@ -147,7 +147,7 @@ def _pendula(**changes: Any) -> Any:
             Horizon(20, 0.5, ((("sensor-gain",), 0.0), (("memory",), 3.2)), ()),
             Horizon(800, 20.0, ((("damping", "sensor-gain"), 0.0),), tuple(Tried(*one, 7.0) for one in tried)),
         ),
-        "inputs": "", "dead": (), "held": (), "left": (),
+        "inputs": "", "dead": (), "held": (), "exchanged": (), "left": (),
         "data": (Samples(t, seen, source="pendula.csv", ends="free"),), "used": (800, 800),
         "noise": size, "noise_lines": ("sensor 1: 0.03", "sensor 2: 0.02"), "residual": (15.0, 1.0),
         "rms": (0.4, 0.025), "dynamics": (0.3, 0.02), "forecasts": ([far], [near]), "forecast": (0.8, 0.01),

@@ -73,8 +73,9 @@ def test_a_term_at_one_site_stands_beside_the_equation_and_not_in_it(forms: Form
     pair = [*forms(find("next-neighbour"), chain), *forms(find("defect"), chain)]
     found = shown("u[n+1]+u[n-1]-2*u[n]; u[n]", pair, chain)
     assert [one.effect for one in found.terms] == [None, None, "next-neighbour"]
-    (line,) = found.elsewhere
-    assert line.startswith("site 1 alone has ")
+    lines = found.elsewhere
+    assert [line.rsplit("*", 1)[1] for line in lines] == ["u[n] besides", "sin(u[n]) besides"]
+    assert all(line.startswith("site 1 alone has ") for line in lines)
 
 
 @pytest.mark.parametrize(
