@@ -243,7 +243,7 @@ def _problem(
     _check_enough(problem)
     _check_room(problem)
     if other := exchanged(problem):
-        columns = ", ".join(f"u{site + 1}" for site in other)
+        columns = ", ".join(data[0].columns([site]) for site in other)
         log.warning("%s: with columns in the order %s the equation leaves much less", data[0].source, columns)
     return problem, dead
 
