@@ -132,7 +132,7 @@ class Problem:
         span = float(longest.t[-1] - longest.t[0])
         nodes = tuple(plain.pack(*both) for both in states)
         own = plain.parts * plain.count
-        if _relaxes(spectrum, span, order):
+        if _relaxes(spectrum, span, chain):
             top = max([top, *(_rate(one[:, :own], samples.t) for one, samples in zip(nodes, data, strict=True))])
         past = tuple(
             course(one.t, split_parts(field[0], first.is_complex)) for one, field in zip(data, states, strict=True)
@@ -184,7 +184,7 @@ class Problem:
     @property
     def relaxes(self) -> bool:
         """Whether the lattice relaxes instead of swinging: no period tells what acts at a time of its own."""
-        return _relaxes(self.spectrum, self.scene.span, self.order)
+        return _relaxes(self.spectrum, self.scene.span, self.chain)
 
     @functools.cached_property
     def fastest(self) -> float:
@@ -295,9 +295,12 @@ def _check_gaps(data: Sequence[Samples]) -> None:
             )
 
 
-def _relaxes(spectrum: Spectrum, span: float, order: int) -> bool:
-    """Return whether a lattice of first order has no peak in its spectrum but for less than a wave in the recording."""
-    return order == 1 and not np.any(spectrum.peaks * span > 2 * np.pi)
+def _relaxes(spectrum: Spectrum, span: float, chain: Chain) -> bool:
+    """Return whether a real field of first order has no peak in its spectrum but for less than a wave in all.
+
+    A complex one has a phase, which turns, and positions with velocities swing, however short the recording is.
+    """
+    return chain.order == 1 and not chain.is_complex and not np.any(spectrum.peaks * span > 2 * np.pi)
 
 
 def _rate(u: Float[ndarray, "time sensors"], t: Float[ndarray, " time"]) -> float:

@@ -17,6 +17,7 @@ from unittest import mock
 import pytest
 
 from latticebench.bench.cli import main
+from latticebench.bench.report import screen
 from pace import pace
 
 # Gives the seeds of an attack from one number to before another; `--fresh` moves them.
@@ -58,6 +59,8 @@ def latticebench(*arguments: object, cwd: Path) -> tuple[int, str, str]:
     try:
         with (
             mock.patch.object(sys, "argv", ["latticebench", *map(str, arguments)]), redirect_stdout(out),
+            # How long a command takes is no matter of what it complains of.
+            mock.patch.object(screen, "LINE_EVERY", float("inf")),
             redirect_stderr(err), mock.patch.dict(os.environ), pytest.raises(SystemExit) as end,
         ):  # fmt: skip
             main()
