@@ -59,14 +59,14 @@ def fit(data: Sequence[Samples], library: Library, order: int, method: Method, s
 def judged(data: Sequence[Samples], found: Fit) -> Adequacy:
     """Return how well a fitted equation describes the recordings it was fitted to, with hints where it does not."""
     from latticebench.bench.adequacy import adequacy
-    from latticebench.bench.report.notes import doubts, in_order
+    from latticebench.bench.report.notes import doubts, mixed_up
     from latticebench.diagnosis import exchanged
 
     how_well = adequacy(data, found)
     if how_well.fits:
         return how_well
     order = exchanged.of_recordings(found.library, found.order, data)
-    return how_well.also((*doubts(data, found.library), *([in_order(data[0], order)] if order else [])))
+    return how_well.also((*doubts(data, found.library), *([mixed_up(data[0], order)] if order else [])))
 
 
 def diagnose(

@@ -76,6 +76,7 @@ class Problem:
         scene: where effects are placed.
         candidates: all effects in all places.
         held: what was left out of recordings as they begin and end.
+        exchanged: the order of the columns, from 0, that suits the declared equation much better; () where none does.
         unrounded: where the mean error of rounded readings has been taken away, the smallest noise with it; else 0.
     """
 
@@ -96,6 +97,7 @@ class Problem:
     fineness: float = 1.0
     unrounded: float = 0.0
     held: tuple[Held, ...] = ()
+    exchanged: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, declared: Library, order: int, data: Sequence[Samples], catalogue: Sequence[Effect]) -> Problem:

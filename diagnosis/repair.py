@@ -242,8 +242,9 @@ def _problem(
     _check_outer(problem)
     _check_enough(problem)
     _check_room(problem)
-    if other := exchanged(problem):
-        columns = ", ".join(data[0].columns([site]) for site in other)
+    problem = replace(problem, exchanged=exchanged(problem))
+    if problem.exchanged:
+        columns = ", ".join(data[0].columns([site]) for site in problem.exchanged)
         log.warning("%s: with columns in the order %s the equation leaves much less", data[0].source, columns)
     return problem, dead
 
@@ -405,7 +406,7 @@ def _diagnosis(
         criterion=(0.0, more * float(np.log(after.layout.readings())) - gain),
         declared=both(lambda one: np.array(one.model.coefficients[:count])),
         modes=(modes.of_recording(problem), modes.of_model(before), modes.of_model(after)),
-        inputs=in_words(problem), dead=dead, held=problem.held, exchanged=exchanged(problem),
+        inputs=in_words(problem), dead=dead, held=problem.held, exchanged=problem.exchanged,
     )  # fmt: skip
 
 

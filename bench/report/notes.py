@@ -186,7 +186,7 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
             "work; what it reads was left out, and its site moves as the equation says."
         )
     if diagnosis.exchanged:
-        yield f"{in_order(diagnosis.data[0], diagnosis.exchanged)}."
+        yield f"{mixed_up(diagnosis.data[0], diagnosis.exchanged)}."
     for held in diagnosis.held:
         yield resting_at(held)
     for samples in _joined(diagnosis.data):
@@ -206,7 +206,7 @@ def _of_the_readings(diagnosis: Diagnosis) -> Iterator[str]:
         yield f"Between its samples the measured input was taken as {diagnosis.inputs}, which the readings suit best."
 
 
-def in_order(samples: Samples, order: Sequence[int]) -> str:
+def mixed_up(samples: Samples, order: Sequence[int]) -> str:
     """Return in which order of the columns an equation leaves much less, and what reads them so."""
     names = [samples.columns([site]) for site in order]
     line = f"{samples.source}: the declared equation leaves much less with the columns in the order {', '.join(names)}"

@@ -10,8 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.bench.calls import judged
-from latticebench.bench.report.notes import in_order as in_words
-from latticebench.bench.report.notes import notes
+from latticebench.bench.report.notes import mixed_up, notes
 from latticebench.diagnosis.exchanged import exchanged, of_recordings
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
@@ -79,7 +78,7 @@ def test_a_bad_sensor_is_no_other_order(fault, site, ends):
 
 def test_where_more_than_u_was_read_no_option_is_said_to_put_all_in_order():
     data = pendula()
-    assert "--columns" not in in_words(replace(data, v=data.u), (0, 2, 1, 3, 4))
+    assert "--columns" not in mixed_up(replace(data, v=data.u), (0, 2, 1, 3, 4))
 
 
 def test_a_diagnosis_and_a_fit_say_which_columns_look_exchanged(caplog):
