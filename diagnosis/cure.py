@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis.reading import read_by
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.systems.stencil import numbers
 from latticebench.systems.terms import combination
@@ -107,7 +108,8 @@ def _when(factor: object) -> str:
 def corrected(model: Model, samples: Samples, recording: int) -> Samples:
     """Return a recording as instruments without the model's faults would have read it; what is missing stays so.
 
-    A zero that wanders is no number, and stays; so does a lag where no velocities were read.
+    A zero that wanders is no number, and stays; so does a lag where no velocities were read. Where a clock jumps, times
+    are corrected.
 
     Args:
         model: whose instruments are undone.
@@ -115,15 +117,16 @@ def corrected(model: Model, samples: Samples, recording: int) -> Samples:
         recording: its number among those that the model was fitted to.
     """
     faults = [placed for placed, _ in model.instruments(recording) if placed.quickened() is None]
+    t = samples.t + sum(placed.told(samples.t) - samples.t for placed in faults)
+    faults = [placed for placed in faults if np.array_equal(placed.told(samples.t), samples.t)]
     if not faults:
-        return samples
+        return replace(samples, t=t)
     both = samples.v is not None and model.order == 2
     fields = [samples.u, samples.v] if both and samples.v is not None else [samples.u]
     read = np.stack([split_parts(one, samples.is_complex) for one in fields], axis=1)
     field = read.copy()
     for _ in range(STEPS):
-        wrong = [placed.misread(samples.t, field) for placed in faults]
-        slope = 1 + sum(one.slope for one in wrong)
-        field -= (field + sum(one.added for one in wrong) - read) / slope
+        wrong = read_by(faults, samples.t, field)
+        field -= (field + wrong.added - read) / (1 + wrong.slope)
     parts = field[:, :, 0] + (1j * field[:, :, 1] if samples.is_complex else 0.0)
-    return replace(samples, u=parts[:, 0], v=parts[:, 1] if both else samples.v)
+    return replace(samples, t=t, u=parts[:, 0], v=parts[:, 1] if both else samples.v)

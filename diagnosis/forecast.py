@@ -15,6 +15,7 @@ from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.past import past_of
 from latticebench.diagnosis.problem import Problem
+from latticebench.diagnosis.reading import read_by
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.systems.samples import Samples
 
@@ -209,10 +210,8 @@ def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Predi
             found.append(state)
             past.learn(float(end), state)
         whole = problem.plain.whole(np.stack(found), record.stretches.driven(late, problem.splines[number]))
-        field = whole[:, : problem.chain.levels]
-        predicted = field[:, 0].copy()
-        for placed, _ in model.instruments(number):
-            predicted += placed.misread(late, whole).added[:, 0]
+        instruments = [placed for placed, _ in model.instruments(number)]
+        predicted = whole[:, 0] + read_by(instruments, late, whole).added[:, 0]
         # Nothing is likelier of a zero that wanders than that it stays where it is.
         predicted += again.zeros(number)[0]
         seen = split_parts(samples.u[cut : cut + MOST_ROWS], samples.is_complex)

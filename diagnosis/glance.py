@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import betaincinv, gammaincinv
 
 from latticebench.diagnosis import rules
+from latticebench.diagnosis.acceleration import Acceleration
 from latticebench.diagnosis.acting import Force, InStep, Placed
 from latticebench.diagnosis.normal import by_pieces
 from latticebench.diagnosis.propagation import propagate
@@ -82,8 +83,8 @@ class _Pull:
     def __init__(self, tangent: Tangent, number: int, readings: ndarray) -> None:
         self.tangent, self.number = tangent, number
         self.t, self.chain = tangent.along[number].t, tangent.fitted.chain
-        chain, (own, by_rate) = self.chain, tangent.slopes(number)
-        self.dual = _dual(tangent, number, readings * own[..., None], _by_rates(readings, by_rate))
+        chain, (own, by_rates) = self.chain, tangent.slopes(number)
+        self.dual = _dual(tangent, number, readings * own[..., None], _by_rates(readings, by_rates))
         self.readings = readings.reshape(len(self.t), chain.levels, chain.parts, chain.sites, -1)[:, 0]
         self.courses: dict[InStep | None, ndarray] = {}
 
@@ -125,6 +126,9 @@ class _Pull:
     def _added_in_time(self, force: Force) -> ndarray:
         """Return derivatives by the factor of what is added to readings of u at each time: (rows, 1 + D)."""
         weights = np.ones(self.chain.sites) if force.weights is None else force.weights
+        if force.text == "v[n]":
+            rate = self.tangent.along[self.number].field[:, 1] * weights
+            return np.asarray(np.einsum("rqn,rqnk->rk", rate, self.readings))
         return np.asarray(np.einsum("n,rnk->rk", weights, self.readings[:, int(force.text.startswith("i*"))]))
 
 
@@ -138,23 +142,31 @@ def _looked(tangent: Tangent) -> list[ndarray]:
     return np.split(readings, ends[:-1])
 
 
-def _by_rates(readings: ndarray, by_rate: ndarray | None) -> ndarray | None:
-    """Return derivatives by v from those by the readings (rows, channels, 1 + D): (rows, parts, N, 1 + D)."""
-    if by_rate is None:
+def _by_rates(readings: ndarray, by_rates: ndarray | None) -> ndarray | None:
+    """Return derivatives by v and its rate from those by the readings (rows, channels, 1 + D).
+
+    They have the shape (rows, 2, parts, N, 1 + D).
+    """
+    if by_rates is None:
         return None
-    return np.asarray(readings[:, : by_rate[0].size].reshape(*by_rate.shape, -1) * by_rate[..., None])
+    levels = readings.reshape(*by_rates.shape[:2], 1, *by_rates.shape[3:], -1)
+    return np.asarray(np.sum(levels * by_rates[..., None], axis=1))
 
 
 def _dual(tangent: Tangent, number: int, readings: ndarray, rates: ndarray | None) -> ndarray:
-    """Return derivatives by forces from those by the readings' fields (rows, channels, 1 + D) and by their rates."""
+    """Return derivatives by forces from those by the readings' fields (rows, channels, 1 + D) and by rates."""
     layout, along, chain = tangent.fitted.layout, tangent.along[number], tangent.fitted.chain
     (pieces, m), count = layout.rows[number].shape, readings.shape[-1]
     fields = readings.reshape(pieces, m, chain.levels, chain.parts, chain.sites, count)[..., layout.plain.moving, :]
     by_state = np.zeros((pieces, m, count, chain.order, *fields.shape[3:5]))
     by_state[:, :, :, : chain.levels] = np.moveaxis(fields, -1, 2)
     if rates is not None:
-        moving = rates.reshape(pieces, m, chain.parts, chain.sites, count)[..., layout.plain.moving, :]
-        by_state[:, :, :, 1] += np.moveaxis(moving, -1, 2)
+        moving = rates.reshape(pieces, m, 2, chain.parts, chain.sites, count)[..., layout.plain.moving, :]
+        by_v, by_a = np.moveaxis(moving, (2, -1), (0, 3))
+        times = layout.records[number].times[layout.rows[number]]
+        for level, one in enumerate(Acceleration.along(times).back(by_a)):
+            by_state[:, :, :, level] += one
+        by_state[:, :, :, 1] += by_v
     by_state = by_state.reshape(pieces, m, count, -1)
     back = np.swapaxes(tangent.followed.transitions[number][:, ::-1], 2, 3)
     carried = propagate(back, by_state[:, -2::-1], by_state[:, -1])[:, ::-1]

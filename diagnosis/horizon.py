@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from latticebench.diagnosis import rules
+from latticebench.diagnosis.acceleration import with_rates
 from latticebench.diagnosis.acting import Chain
 from latticebench.diagnosis.border import Border, borders
 from latticebench.diagnosis.model import Assembled, Model
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.propagation import propagate
+from latticebench.diagnosis.reading import is_late, read_by
 from latticebench.diagnosis.rows import Rows
 from latticebench.methods.engine.dynamics import Dynamics
 from latticebench.methods.engine.record import Record
@@ -231,7 +233,8 @@ class Path:
         level: the model's readings, rows of all recordings one after another (rows, channels).
         left: readings less that, NaN where nothing was read.
         own: derivatives of the readings by the field (rows, channels).
-        by_rate: those of the readings of u by v, of all recordings one after another (rows, parts, N); None for 0.
+        by_rates: those by v and its rate, of all recordings one after another (rows, levels, 2, parts, N), but for
+            those by its own field; None for 0.
     """
 
     model: Model
@@ -240,7 +243,7 @@ class Path:
     level: Float[ndarray, "rows channels"]
     left: Float[ndarray, "rows channels"]
     own: Float[ndarray, "rows channels"]
-    by_rate: Float[ndarray, "rows parts sites"] | None
+    by_rates: Float[ndarray, "rows levels 2 parts sites"] | None
 
     @property
     def size(self) -> int:
@@ -271,7 +274,7 @@ class Followed(Path):
     @property
     def path(self) -> Path:
         """The motion alone."""
-        return Path(self.model, self.nodes, self.splines, self.level, self.left, self.own, self.by_rate)
+        return Path(self.model, self.nodes, self.splines, self.level, self.left, self.own, self.by_rates)
 
     @property
     def local(self) -> int:
@@ -327,7 +330,7 @@ def linearised(path: Path, layout: Layout) -> Followed | None:
         return None
     slope = _slopes(path, layout, moves)
     return Followed(
-        path.model, path.nodes, path.splines, path.level, path.left, path.own, path.by_rate, tuple(moves),
+        path.model, path.nodes, path.splines, path.level, path.left, path.own, path.by_rates, tuple(moves),
         tuple(transitions), slope,
     )  # fmt: skip
 
@@ -422,11 +425,12 @@ def _readings(
         rows = layout.rows[number]
         t, field = fields(layout, number, nodes[number], splines[number])
         level = field[:, : layout.chain.levels]
-        own, rate = np.ones_like(level), np.zeros_like(field[:, 0])
-        for placed, _ in model.instruments(number):
-            wrong = placed.misread(t, field).read(layout.chain.levels)
+        own, rate = np.ones_like(level), np.zeros((*level.shape[:2], 2, *level.shape[2:]))
+        if instruments := [placed for placed, _ in model.instruments(number)]:
+            field = with_rates(layout.records[number].times[rows], field) if is_late(instruments) else field
+            wrong = read_by(instruments, t, field).read(layout.chain.levels)
             level, own = level + wrong.added, own + wrong.slope
-            rate = rate if wrong.by_rate is None else rate + wrong.by_rate
+            rate = rate if wrong.by_rates is None else wrong.by_rates
         seen = record.seen[rows] & layout.valid[number][..., None, None, None]
         value = np.where(seen, record.value[rows], np.nan).reshape(level.shape)
         shape = (rows.size, -1)
@@ -434,9 +438,9 @@ def _readings(
         lefts.append((value - level).reshape(shape))
         owns.append(own.reshape(shape))
         rates.append(rate)
-    by_rate = np.concatenate(rates)
+    by_rates = np.concatenate(rates)
     level, left, own = (np.concatenate(one) for one in (levels, lefts, owns))
-    return level, left, own, by_rate if np.any(by_rate) else None
+    return level, left, own, by_rates if np.any(by_rates) else None
 
 
 def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
@@ -452,29 +456,33 @@ def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
         if border is not None:
             times = layout.records[number].times[rows]
             border.add_readings(by[..., size : size + border.size], times, layout.plain.border)
-        by = as_read(by, by_field, path.own[some], None if path.by_rate is None else path.by_rate[some])
+        if path.by_rates is not None:
+            times = layout.records[number].times[rows]
+            field, by_field = with_rates(times, field), with_rates(times, by_field)
+        by = as_read(by, by_field, path.own[some], None if path.by_rates is None else path.by_rates[some])
         begin += rows.size
-        for placed, block in path.model.instruments(number):
-            wrong = np.moveaxis(placed.misread(t, field).read(layout.chain.levels).by, 0, -1)
+        if instruments := path.model.instruments(number):
+            wrong = read_by([one for one, _ in instruments], t, field).read(layout.chain.levels)
             own = count - len(path.model.numbers)
-            by[..., own + block.start : own + block.stop] += wrong.reshape(rows.size, by.shape[1], -1)
+            numbers = np.concatenate([np.arange(own + block.start, own + block.stop) for _, block in instruments])
+            by[..., numbers] += np.moveaxis(wrong.by, 0, -1).reshape(rows.size, by.shape[1], -1)
         found.append(by)
     return np.concatenate(found)
 
 
 def as_read(
-    by: Float[ndarray, "rows levels parts sites count"], by_field: ndarray, own: ndarray, by_rate: ndarray | None
+    by: Float[ndarray, "rows levels parts sites count"], by_field: ndarray, own: ndarray, by_rates: ndarray | None
 ) -> Float[ndarray, "rows channels count"]:
     """Return derivatives of readings from those of what is read.
 
     Args:
         by: derivatives of the levels that are read.
-        by_field: the same of the motion (rows, count, order, parts, N).
+        by_field: the same of the motion (rows, count, levels, parts, N).
         own: derivatives of the readings by their fields, see `Path`.
-        by_rate: those by v.
+        by_rates: those by v and its rate; the motion has this level then, too.
     """
     found: ndarray = by.reshape(*own.shape, -1) * own[..., None]
-    if by_rate is not None:
-        rate = by_rate[..., None] * np.moveaxis(by_field[:, :, 1], 1, -1)
-        found[:, : by_rate[0].size] += rate.reshape(len(found), -1, found.shape[2])
+    if by_rates is not None:
+        moving = np.moveaxis(by_field[:, :, 1:], 1, -1)[:, None]
+        found += np.sum(by_rates[..., None] * moving, axis=2).reshape(found.shape)
     return found

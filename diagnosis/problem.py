@@ -153,6 +153,7 @@ class Problem:
             # Of windows of one recording, none has a zero of its own.
             tuple(map(_read, data)) if len(parts) == len(free) and 1 < len(free) <= SEVERAL else (),
             step,
+            float(spectrum.peaks[0]) if len(spectrum.peaks) else 0.0,
         )
         candidates = tuple(one for effect in catalogue for one in way_of(effect).places(effect, scene))
         return cls(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.reading import read_by
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -27,17 +28,16 @@ def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "tim
         number: of the recording.
         nodes: smoothed readings as states, at all its times.
     """
-    if not model.instruments(number):
+    instruments = [placed for placed, _ in model.instruments(number)]
+    if not instruments:
         return nodes
     record, chain = layout.records[number], layout.chain
     t, driven = record.times, record.stretches.driven(record.times, layout.splines[number])
     reading = layout.plain.whole(nodes, driven)
     field = reading.copy()
     for _ in range(UNREAD):
-        level, own = field[:, : chain.levels], np.ones_like(field[:, : chain.levels])
-        for placed, _ in model.instruments(number):
-            wrong = placed.misread(t, field).read(chain.levels)
-            level, own = level + wrong.added, own + wrong.slope
+        wrong = read_by(instruments, t, field).read(chain.levels)
+        level, own = field[:, : chain.levels] + wrong.added, 1 + wrong.slope
         own = np.where(np.abs(own) > LEAST_SLOPE, own, 1.0)
         field[:, : chain.levels] += (reading[:, : chain.levels] - level) / own
     if chain.levels < field.shape[1]:

@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis.acceleration import with_rates
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted, gain, left_free, whitened
 from latticebench.diagnosis.horizon import as_read, fields
 from latticebench.diagnosis.model import Assembled, Model, read_term
 from latticebench.diagnosis.normal import by_pieces, normal, scaled_inverse
 from latticebench.diagnosis.propagation import propagate
+from latticebench.diagnosis.reading import seen_by
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -58,7 +60,7 @@ class _Along:
     Attributes:
         t: times (rows,).
         states: (rows, S).
-        field: the motion (rows, order, parts, N).
+        field: the motion as it was when it was read and, of order 2, the rate of v (rows, levels, parts, N).
         driven: the sites without an equation.
         assembled: the model.
         early, late: what a force does within an interval that falls from 1 to 0, or grows from 0 to 1 (pieces, m - 1,
@@ -149,6 +151,8 @@ class Tangent:
         ramp = unit[:, :, :, 1] - t[:, :-1, None, None, None] * unit[:, :, :, 0]
         late = np.where(h > 0, ramp / np.where(h > 0, h, 1.0), 0.0)
         times, field = fields(layout, number, y, followed.splines[number])
+        instruments = [one for one, _ in followed.model.instruments(number)]
+        field = seen_by(instruments, times, with_rates(t, field))
         driven = layout.driven(number, followed.splines[number])
         return _Along(times, y.reshape(-1, size), field, driven, assembled, unit[:, :, :, 0] - late, late)
 
@@ -313,8 +317,11 @@ class Tangent:
         forces = [one for one in batch if not one.instrument]
         if forces:
             z = self._moved(number, forces)
-            field = layout.plain.whole(z, None)
-            blocks.append(as_read(np.moveaxis(field[:, :, : chain.levels], 1, -1), field, *self.slopes(number)))
+            field, (own, by_rates) = layout.plain.whole(z, None), self.slopes(number)
+            by = field[:, :, : chain.levels]
+            if by_rates is not None:
+                field = with_rates(layout.records[number].times[rows], field)
+            blocks.append(as_read(np.moveaxis(by, 1, -1), field, own, by_rates))
         for one in batch:
             if one.instrument:
                 by = one.misread(along.t, along.field).read(chain.levels).by
@@ -335,10 +342,10 @@ class Tangent:
         return z.reshape(rows.size, len(push), -1)
 
     def slopes(self, number: int) -> tuple[ndarray, ndarray | None]:
-        """Return the derivatives of one recording's readings by their own fields and by v, see `horizon.Path`."""
+        """Return the derivatives of one recording's readings by their own fields, v and its rate; `horizon.Path`."""
         begin, followed = sum(rows.size for rows in self.fitted.layout.rows[:number]), self.fitted.followed
         some = slice(begin, begin + self.fitted.layout.rows[number].size)
-        return followed.own[some], None if followed.by_rate is None else followed.by_rate[some]
+        return followed.own[some], None if followed.by_rates is None else followed.by_rates[some]
 
     def push(self, number: int, one: Placed) -> ndarray:
         """Return the forces of an effect's numbers, or of one without any, along the motion: (., rows, parts, M)."""

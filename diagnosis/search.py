@@ -21,6 +21,7 @@ from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.inputs import finest, interpolations, likeliest
 from latticebench.diagnosis.mirrored import images, mirrored
 from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.moments import beside
 from latticebench.diagnosis.noise import Structure
 from latticebench.diagnosis.past import past_of, settled
 from latticebench.diagnosis.pool import Pool
@@ -312,7 +313,7 @@ class Search:
                 if found is not None:
                     yield found
         yield from self._exchanged(fitted, pool)
-        for other, near in images(self.problem, fitted):
+        for other, near in (*images(self.problem, fitted), *beside(fitted)):
             found = None if other in pool else self.refit(other, fitted.layout, near, fitted, CHANGED)
             if found is not None:
                 yield found

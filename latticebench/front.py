@@ -117,7 +117,7 @@ class Cause(Exhibit):
         """
         unread = any(one.v is None for one in self.recording.samples)
         placed = [one.placed for one in self.result.findings]
-        staying = [one.effect.name for one in placed if one.wandering() is not None or (one.of_rate and unread)]
+        staying = [one.effect.name for one in placed if one.stays(velocities=not unread)]
         return (*self._cure.left_out, *staying)
 
     @functools.cached_property

@@ -44,9 +44,10 @@ HOW: dict[str, str] = {
     "gain": "the reading is g u; at one site, which is found, with a g for every site, or "
     "with one for all in a recording",
     "curve": "the reading is u + c T(u), T being a power, with one c for all sensors or at one of them",
-    "lag": "the reading is u - tau v, which is u a time tau ago; at one site, which is found, with a tau for every "
-    "site, or with one more tau at each",
+    "lag": "the reading is u a time tau ago; at one site, which is found, with a tau for every site, or with one more "
+    "tau at each",
     "clock": "the recorded times are wrong by a share of themselves",
+    "clock jump": "from one time on readings are of a later time than they say; time found",
 }
 """The ways of acting, each with what it does; `latticebench.diagnosis.acting` has one class for each."""
 
@@ -143,6 +144,7 @@ NAYFEH = "Nayfeh & Mook, Nonlinear Oscillations (1979)"
 BRAUN = "Braun & Kivshar, The Frenkel-Kontorova Model (2004)"
 KEVREKIDIS = "Kevrekidis, The Discrete Nonlinear Schroedinger Equation (2009)"
 ARANSON = "Aranson & Kramer, Rev. Mod. Phys. 74, 99 (2002)"
+SHAW = "Shaw & Holmes, J. Sound Vib. 90, 129 (1983)"
 LJUNG = "Ljung, System Identification (1999)"
 
 CATALOGUE: tuple[Effect, ...] = (
@@ -179,6 +181,10 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "onsite-quintic", "u[n]**5", complex_field="abs(u[n])**4*u[n]",
         look_for="a frequency that moves with the fourth power of the size", source=KEVREKIDIS,
+    ),
+    Effect(
+        "onsite-bilinear", "abs(u[n])", complex_field="", orders=(2,),
+        look_for="swings that take longer to one side, alike at all sizes, as of a crack or of a contact", source=SHAW,
     ),
     Effect("constant-force", "1", look_for="a rest state moved the same way everywhere", source=BRAUN),
     Effect(
@@ -218,6 +224,10 @@ CATALOGUE: tuple[Effect, ...] = (
         "quadratic-coupling", "(u[n+1]-u[n])**2-(u[n-1]-u[n])**2", complex_field="",
         look_for="springs that are stiffer stretched than pressed, or the other way round",
         source="Fermi, Pasta & Ulam, Studies of Nonlinear Problems, Los Alamos LA-1940 (1955)",
+    ),
+    Effect(
+        "bilinear-coupling", "abs(u[n+1]-u[n])-abs(u[n]-u[n-1])", complex_field="", orders=(2,),
+        look_for="springs that are softer when stretched than when pressed, alike at all sizes", source=SHAW,
     ),
     Effect(
         "bond-damping", "v[n+1]+v[n-1]-2*v[n]", orders=(2,), real=True,
@@ -266,6 +276,10 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "local-damping", "v[n]", acts="one site", orders=(2,),
         look_for="amplitudes that fall fastest where one site moves most", source=NAYFEH,
+    ),
+    Effect(
+        "local-bilinear", "abs(u[n])", complex_field="", acts="one site", orders=(2,),
+        look_for="swings of one site that take longer to one side, alike at all sizes", source=SHAW,
     ),
     Effect(
         "local-drive", "1", acts="harmonic at one site",
@@ -320,5 +334,9 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "clock", "v[n]", acts="clock",
         look_for="a residual in proportion to the velocity, at all sites at once", source=LJUNG,
+    ),
+    Effect(
+        "clock-jump", "v[n]", acts="clock jump", orders=(2,),
+        look_for="a motion that is ahead of itself from one time on, as where a camera drops frames", source=LJUNG,
     ),
 )  # fmt: skip

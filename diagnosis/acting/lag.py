@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, OfSensors, Placed, Scene
+from latticebench.diagnosis.acting.late import Late
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, OfSensors, Placed, Scene
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
@@ -16,19 +17,18 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Lag(OfSensors, acts="lag"):
-    """The reading is u - tau * v, which is u a time tau ago, to first order.
+class Lag(OfSensors, Late, acts="lag"):
+    """The reading is u a time tau ago (`late.misread_late`).
 
     Filters, converters that scan their channels and cameras that are not in step do this. A filter of first order
-    also reads less, by 1 + omega^2 tau^2 at an angular frequency omega: a gain, where the motion has about one
-    frequency. What all sensors lag by is no more than another zero of the time.
+    also reads less, by the root of 1 + omega^2 tau^2 at an angular frequency omega: a gain, where the motion has about
+    one frequency. What all sensors lag by is no more than another zero of the time.
 
     Attributes:
         in_turn: whether each sensor lags behind the one before by the strength; else each site has its own.
     """
 
     in_turn: bool = False
-    of_rate: ClassVar[bool] = True
     separated_by: ClassVar[str] = "a motion of other frequencies: a lag turns into another phase at each of them"
 
     @classmethod
@@ -42,9 +42,9 @@ class Lag(OfSensors, acts="lag"):
             return
         others = chain.moving[1:]
         for sites in [*((site,) for site in chain.moving), *([others] if len(others) > 1 else [])]:
-            yield cls(effect=effect, sites=sites, strength=(0.0,) * len(sites))
+            yield cls(effect=effect, sites=sites, strength=(0.0,) * len(sites), omega=scene.main)
         if len(others) > 1:
-            yield cls(effect=effect, sites=chain.moving, strength=(0.0,), in_turn=True)
+            yield cls(effect=effect, sites=chain.moving, strength=(0.0,), omega=scene.main, in_turn=True)
 
     @property
     def place(self) -> tuple[object, ...]:
@@ -56,23 +56,22 @@ class Lag(OfSensors, acts="lag"):
         """Whether no single sensor is ahead of all others: these then lag."""
         return self.site is None or self.strength[0] >= 0
 
+    def stays(self, *, velocities: bool) -> bool:
+        """Return whether there are no velocities to undo it with."""
+        return not velocities
+
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the columns that lag."""
         if self.in_turn:
             return ("lag from one sensor to the next",)
         return tuple(f"lag of u{site + 1}" for site in self.sites)
 
-    def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
-        """Return what lags add; nothing where the motion has no velocity."""
-        lags = np.eye(field.shape[-1])[list(self.sites)]
+    def lateness(self, t: ndarray, sites: int) -> tuple[ndarray, ndarray]:  # noqa: ARG002
+        """Return the lag of each sensor, and its derivatives by the numbers."""
+        lags = np.eye(sites)[list(self.sites)]
         if self.in_turn:
             lags = np.arange(len(self.sites))[None] @ lags
-        by, by_rate = np.zeros((len(lags), *field.shape)), np.zeros_like(field[:, 0])
-        if field.shape[1] > 1:
-            # Missing velocities concern the sensors that lag, and no others.
-            by[:, :, 0] = np.where(lags[:, None, None] != 0, -lags[:, None, None] * field[:, 1], 0.0)
-            by_rate -= self.strength @ lags
-        return Misreading(np.tensordot(self.strength, by, 1), np.zeros_like(field), by, by_rate)
+        return (self.strength @ lags)[None, None], lags[:, None, None]
 
     def sentences(self, chain: Chain) -> list[str]:
         """Return the lags."""

@@ -86,6 +86,7 @@ class Scene:
         inputs: whether an input was measured.
         recordings: the sites that were read in each recording, where each may have zeros and units of its own.
         step: a typical time between readings.
+        main: the angular frequency of the strongest peak in the spectrum; 0 where there is none.
     """
 
     chain: Chain
@@ -100,6 +101,7 @@ class Scene:
     inputs: bool
     recordings: tuple[tuple[int, ...], ...] = ()
     step: float = 0.0
+    main: float = 0.0
 
     @property
     def middle(self) -> float:
@@ -160,20 +162,21 @@ class Misreading:
     """What an instrument adds to the readings of a motion.
 
     Attributes:
-        added: (rows, order, parts, N), in units of the readings; `read` cuts it to the levels that were read.
+        added: (rows, levels, parts, N), in units of the readings; `read` cuts it to the levels that were read.
         slope: its derivative by the reading's own field, likewise; dimensionless.
-        by: its derivatives by the numbers of the effect (numbers, rows, order, parts, N).
-        by_rate: derivatives of what is added to u by v (rows, parts, N), in units of time; None for 0.
+        by: its derivatives by the numbers of the effect (numbers, rows, levels, parts, N).
+        by_rates: those by v and its rate (rows, levels, 2, parts, N), but for the reading's own field; None for 0.
     """
 
-    added: Float[ndarray, "rows order parts sites"]
-    slope: Float[ndarray, "rows order parts sites"]
-    by: Float[ndarray, "numbers rows order parts sites"]
-    by_rate: Float[ndarray, "rows parts sites"] | None = None
+    added: Float[ndarray, "rows levels parts sites"]
+    slope: Float[ndarray, "rows levels parts sites"]
+    by: Float[ndarray, "numbers rows levels parts sites"]
+    by_rates: Float[ndarray, "rows levels 2 parts sites"] | None = None
 
     def read(self, levels: int) -> Misreading:
         """Return what concerns the levels that were read."""
-        return Misreading(self.added[:, :levels], self.slope[:, :levels], self.by[:, :, :levels], self.by_rate)
+        by_rates = None if self.by_rates is None else self.by_rates[:, :levels]
+        return Misreading(self.added[:, :levels], self.slope[:, :levels], self.by[:, :, :levels], by_rates)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +206,6 @@ class Placed(ABC):
         general: whether it is looked for only in the place of another effect: as what that one is a special case of, or
             at declared terms. With a number for each bond it would take whatever is missing where there is hardly any
             noise.
-        of_rate: whether what it makes of readings of u depends on v.
         separated_by: the measurement that tells this way of acting from others; nothing where none is known.
     """
 
@@ -216,7 +218,6 @@ class Placed(ABC):
     local: ClassVar[bool] = False
     fed: ClassVar[bool] = False
     general: ClassVar[bool] = False
-    of_rate: ClassVar[bool] = False
     separated_by: ClassVar[str] = ""
 
     def __init_subclass__(cls, acts: str = "", how: str = "") -> None:
@@ -311,7 +312,7 @@ class Placed(ABC):
         return []
 
     def courses(self, chain: Chain) -> list[Force]:  # noqa: ARG002
-        """Return what it adds to readings of u in time, whatever the field: terms "1" and "i*1" with their factors."""
+        """Return what it adds to readings of u in time: terms "1", "i*1" and "v[n]" with their factors."""
         return []
 
     def scaled(self) -> int | None:
@@ -321,6 +322,14 @@ class Placed(ABC):
     def quickened(self) -> float | None:
         """Return the excess over 1 of how fast all goes by the recording's clock; None where that is right."""
         return None
+
+    def stays(self, *, velocities: bool) -> bool:  # noqa: ARG002
+        """Return whether corrected readings still have it; `velocities` says whether those were read."""
+        return False
+
+    def told(self, t: Float[ndarray, " rows"]) -> Float[ndarray, " rows"]:
+        """Return the times that a right clock would have shown."""
+        return t
 
     def other_ends(self) -> Ends | None:
         """Return how the chain ends instead of as declared; None where that does not change."""
@@ -335,7 +344,7 @@ class Placed(ABC):
         return self
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:
-        """Return what the instrument makes of a motion: u, and where it has one, v (rows, order, parts, N)."""
+        """Return what the instrument makes of u and, where there are, v and its rate (rows, levels, parts, N)."""
         raise NotImplementedError(f"{self.effect.name} acts on the motion, not on readings")
 
     @property

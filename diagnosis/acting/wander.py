@@ -45,6 +45,10 @@ class Wander(OfSensors, acts="wander"):
         """Return nothing: no number of the model belongs to it."""
         return ()
 
+    def stays(self, *, velocities: bool) -> bool:  # noqa: ARG002
+        """Return True: it is no number."""
+        return True
+
     def wandering(self) -> int:
         """Return the site."""
         return self.sites[0]

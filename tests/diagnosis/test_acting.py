@@ -27,7 +27,7 @@ SITES, NOISE, SMALL = 5, 0.01, 1e-5
 COUPLING = "u[n+1]+u[n-1]-2*u[n]"
 REAL = (library("duffing", f"{COUPLING}; u[n]; u[n]**3"), (0.9, -1.0, -0.3))
 COMPLEX = (library("turning", f"i*({COUPLING}); i*abs(u[n])**2*u[n]"), (0.8, 0.6))
-EVERY_WAY = [(way, False) for way in WAYS] + [(way, True) for way in WAYS if way not in ("clock", "lag")]
+EVERY_WAY = [(way, False) for way in WAYS] + [(way, True) for way in WAYS if way not in ("clock", "clock jump", "lag")]
 # These have no numbers: the noise says how far a zero wanders.
 NUMBERED = [pair for pair in EVERY_WAY if pair[0] not in ("ends", "wander")]
 
@@ -320,7 +320,8 @@ def test_a_way_of_acting_that_a_user_adds_is_found_in_data_made_with_it(ramped):
 # What depends on the past or on another clock is no term of the state.
 UNSAID = ("delayed", "clock")
 MOVING = [pair for pair in EVERY_WAY if not WAYS[pair[0]].instrument and pair[0] not in (*UNSAID, "ends")]
-READING = [pair for pair in EVERY_WAY if WAYS[pair[0]].instrument and pair[0] not in (*UNSAID, "wander")]
+# A clock that jumps makes other times of the readings, not other readings.
+READING = [pair for pair in EVERY_WAY if WAYS[pair[0]].instrument and pair[0] not in (*UNSAID, "wander", "clock jump")]
 
 
 def forces(dynamics: Dynamics, coefficients: np.ndarray, is_complex: bool) -> np.ndarray:

@@ -60,6 +60,9 @@ SECOND_ORDER = (
     # For order 1 this would be disorder, and the next one asymmetric coupling.
     "other: absorbing-ends",
     "other: gyroscopic-bonds",
+    "onsite-bilinear",
+    "local-bilinear",
+    "bilinear-coupling",
 )
 COMPLEX = ("other: phase-conjugation", "other: nonlocal-response")
 REAL = (
@@ -94,6 +97,7 @@ MISREADINGS = {
     "sensor-wander": _misread(instrument.wander),
     "sensor-hum": _misread(instrument.humming),
     "sensor-lag": replace(_misread(instrument.slow), only="second order"),
+    "clock-jump": replace(_misread(instrument.dropped), only="second order"),
     # Where only u is read, another unit of time does the same.
     "clock": replace(_misread(instrument.slow_clock), only="second order"),
 }

@@ -76,6 +76,11 @@ def slow_clock(setting: Setting, size: float) -> Fields:
     return setting.at(begin + (1 + size) * (setting.times - begin)).run()
 
 
+def dropped(setting: Setting, size: float) -> Fields:
+    """Read each row of a while later, from one time on."""
+    return setting.at(setting.times + size * (setting.times > setting.drawn.about["at"])).run()
+
+
 def jitter(setting: Setting, size: float) -> Fields:
     """Read each row a little late or early, within the record."""
     times, drawn = setting.times, setting.drawn

@@ -142,6 +142,7 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "onsite-quadratic": lambda m: (np.abs(m.u) if m.chain.is_complex else m.u) * m.u,
     "onsite-cubic": lambda m: np.abs(m.u) ** 2 * m.u,
     "onsite-quintic": lambda m: np.abs(m.u) ** 4 * m.u,
+    "onsite-bilinear": lambda m: np.abs(m.u),
     "constant-force": lambda m: np.ones(len(m.u)),
     "drive": lambda m: m.wave() * np.ones(len(m.u)),
     "parametric-drive": lambda m: m.wave() * m.u,
@@ -154,6 +155,7 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     ),
     "next-neighbour": lambda m: m.stretch(2) + m.stretch(-2),
     "quadratic-coupling": lambda m: m.stretch(1) ** 2 - m.stretch(-1) ** 2,
+    "bilinear-coupling": lambda m: np.abs(m.stretch(1)) - np.abs(m.stretch(-1)),
     "bond-damping": between,
     "nonlinear-coupling": lambda m: (
         np.abs(m.stretch(1)) ** 2 * m.stretch(1) + np.abs(m.stretch(-1)) ** 2 * m.stretch(-1)
@@ -166,6 +168,7 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "defect": lambda m: np.eye(len(m.u))[m.drawn.site] * m.u,
     "bond-defect": loose,
     "local-damping": lambda m: -np.eye(len(m.u))[m.drawn.site] * m.v,
+    "local-bilinear": lambda m: np.eye(len(m.u))[m.drawn.site] * np.abs(m.u),
     "local-drive": lambda m: m.wave() * np.eye(len(m.u))[m.drawn.site],
     "local-kick": lambda m: m.pulse() * np.eye(len(m.u))[m.drawn.site],
     "disorder": lambda m: m.drawn.each * m.u,

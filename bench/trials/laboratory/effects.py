@@ -2,8 +2,8 @@
 
 Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
 "cos", "sin" and "omega" (of a drive, at all sites or at one, or of a sensor's hum), "offset_2", "gain_2", "curve_2",
-"lag_2" and "jump_2" (of the second sensor, which reads gain * u + offset + curve * u^2 - lag * v, and from the time
-"when" on jump more), "curve" and "cubic" (one for all, the latter of u^3), "bond_2" (from the second site on), and
+"lag_2" and "jump_2" (of the second sensor, which reads gain * u + offset + curve * u^2 of a time lag ago, and from the
+time "when" on jump more), "curve" and "cubic" (one for all, the latter of u^3), "bond_2" (from the second site on), and
 "ramp of u[n]" (how fast that coefficient changes) and "step of u[n]" (by how much it does, at "when").
 """
 

@@ -10,7 +10,7 @@ follows a B-spline in time, whose coefficients are parameters like the others.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -243,13 +243,25 @@ class Experiment:
         with np.errstate(all="ignore"):
             found = solve_ivp(
                 rate, (0.0, float(self.times[-1])), start.ravel(), t_eval=self.times, method="DOP853",
-                rtol=tolerance, atol=small, events=lost,
+                rtol=tolerance, atol=small, events=lost, dense_output=bool(np.any(sensors.lag)),
             )  # fmt: skip
-        if found.status != 0 or not np.all(np.isfinite(found.y)):
-            return None
-        u, v = np.moveaxis(found.y.reshape(*start.shape, -1), -1, 1)
-        rows = zip(self.times, u, v, strict=True)
-        return np.moveaxis(np.stack([sensors.read(float(t), held(float(t), row), by) for t, row, by in rows]), 0, 1)
+            if found.status != 0 or not np.all(np.isfinite(found.y)):
+                return None
+            behind = np.zeros((len(self.times), 1, 1))
+            if found.sol is not None:
+                # What a sensor shows first was before the start.
+                earliest = -max(float(np.max(sensors.lag)), 0.0)
+                back = solve_ivp(
+                    rate, (0.0, earliest), start.ravel(), method="DOP853", rtol=tolerance, atol=small,
+                    dense_output=True,
+                )  # fmt: skip
+                behind = sensors.behind(
+                    self.times,
+                    lambda t: np.where(t < 0, back.sol(np.minimum(t, 0.0)), found.sol(t)).reshape(*start.shape, -1),
+                )
+        u = np.moveaxis(found.y.reshape(*start.shape, -1), -1, 1)[0]
+        rows = zip(self.times, u, behind, strict=True)
+        return np.moveaxis(np.stack([sensors.read(float(t), held(float(t), row) + by) for t, row, by in rows]), 0, 1)
 
 
 class _Table:
@@ -326,9 +338,24 @@ class _Sensors:
         sites_that_hum = [name.removeprefix("hum.cos@") for name in of if name.startswith("hum.cos")]
         self.hums = {int(k): [of[f"hum.{name}@{k}"] for name in ("cos", "sin", "omega")] for k in sites_that_hum}
 
-    def read(self, t: float, u: Float[ndarray, "copies sites"], v: Float[ndarray, "copies sites"]) -> ndarray:
-        """Return the readings."""
-        found = np.asarray(self.gain * u + self.offset + self.curve * u**2 + self.cubic * u**3 - self.lag * v)
+    def behind(self, times: ndarray, motion: Callable[[ndarray], ndarray]) -> Float[ndarray, "time copies sites"]:
+        """Return by how much positions were more a lag ago.
+
+        Args:
+            times: of the readings.
+            motion: u and v at given times (2, copies, sites, T).
+        """
+        now, found = np.moveaxis(motion(times)[0], -1, 0), np.zeros((len(times), *self.lag.shape))
+        for site in np.flatnonzero(np.any(self.lag, axis=0)):
+            lag = float(self.lag[0, site])
+            u, v = np.moveaxis(motion(times - lag)[:, :, site], -1, 1)
+            # In a copy that differs by its lag, to first order in that.
+            found[..., site] = u - (self.lag[:, site] - lag) * v - now[..., site]
+        return found
+
+    def read(self, t: float, u: Float[ndarray, "copies sites"]) -> ndarray:
+        """Return the readings of positions as they were when they were read."""
+        found = np.asarray(self.gain * u + self.offset + self.curve * u**2 + self.cubic * u**3)
         for site, (cos, sin, omega) in self.hums.items():
             found[:, site] += (cos * np.cos(omega * t) + sin * np.sin(omega * t))[:, 0]
         for site, (jump, when) in self.jumps.items():

@@ -1,0 +1,76 @@
+"""A clock that jumps: a camera that drops frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from latticebench.diagnosis.acting.late import Late
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Placed, Scene
+from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
+from latticebench.diagnosis.acting.sudden import Rise, Sudden
+from latticebench.systems.effects import Effect
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+# The width of a jump over the time between two readings: frames are missing between two of those that are left.
+BETWEEN = 0.2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ClockJump(Sudden, Late, acts="clock jump"):
+    """From one time on all readings are of a time later by the strength than they say (`late.misread_late`).
+
+    Cameras drop frames where a computer does not keep up: the frames that are left are numbered through.
+    """
+
+    velocities: ClassVar[bool] = True
+    separated_by: ClassVar[str] = "a second clock in the picture, or the times that the camera writes itself"
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return times all over the recordings."""
+        chain, apart = scene.chain, scene.span / MOST_MIDDLES
+        if not effect.texts(chain.order, chain.is_complex):
+            return
+        for at in scene.begin + apart * np.arange(1, MOST_MIDDLES):
+            yield cls(
+                effect=effect, strength=(0.0,), at=float(at), width=apart / 2, least=BETWEEN * scene.step,
+                seen=scene.seen, omega=scene.main,
+            )  # fmt: skip
+
+    @property
+    def possible(self) -> bool:
+        """Whether it happens within the recording, and no clock goes back by more than the time between readings."""
+        return super().possible and self.strength[0] > -self.least / BETWEEN
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
+        """Return what the number is."""
+        return ("time that the clock loses",)
+
+    def courses(self, chain: Chain) -> list[Force]:  # noqa: ARG002
+        """Return the velocity from the jump on and, for time and width, its derivatives by them; to first order."""
+        (lost,), wide = self.strength, self.wide
+        found = [Force("v[n]", lost, {0: 1.0}, None, Rise(self.at, wide))]
+        if lost:
+            found.append(Force("v[n]", 0.0, {1: lost / wide}, None, Rise(self.at, wide, 0)))
+            found.append(Force("v[n]", 0.0, {2: lost * self.width / wide**2}, None, Rise(self.at, wide, 1)))
+        return found
+
+    def lateness(self, t: ndarray, sites: int) -> tuple[ndarray, ndarray]:  # noqa: ARG002
+        """Return how late readings are, which is less than not at all, and its derivatives by the numbers."""
+        (lost,), wide = self.strength, self.wide
+        rise, by_time, by_width = (Rise(self.at, wide, power)(t)[0, :, :, None] for power in (None, 0, 1))
+        return -lost * rise, -np.stack([rise, lost / wide * by_time, lost * self.width / wide**2 * by_width])
+
+    def told(self, t: ndarray) -> ndarray:
+        """Return the times with what was lost."""
+        return np.asarray(t + self.strength[0] * Rise(self.at, self.wide)(t)[0, :, 0])
+
+    def sentences(self, chain: Chain) -> list[str]:
+        """Return how much time is lost, and when."""
+        return [f"{self.labels(chain)[0]}: {self.strength[0]:.{DIGITS}g} at t = {self.at:.{DIGITS}g}"]
