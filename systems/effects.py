@@ -278,6 +278,11 @@ CATALOGUE: tuple[Effect, ...] = (
         look_for="amplitudes that fall fastest where one site moves most", source=NAYFEH,
     ),
     Effect(
+        "local-cubic", "u[n]**3", complex_field="abs(u[n])**2*u[n]", acts="one site",
+        look_for="a residual at one site that grows with the cube of its swings, as beside a magnet or of an impurity",
+        source="Molina & Tsironis, Phys. Rev. B 47, 15330 (1993)",
+    ),
+    Effect(
         "local-bilinear", "abs(u[n])", complex_field="", acts="one site", orders=(2,),
         look_for="swings of one site that take longer to one side, alike at all sizes", source=SHAW,
     ),
@@ -300,6 +305,11 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "disorder", "u[n]", acts="every site",
         look_for="a residual of each site's own", source="Anderson, Phys. Rev. 109, 1492 (1958)",
+    ),
+    Effect(
+        "own-rates", "1", complex_field="", acts="every site", orders=(1,),
+        look_for="sites that drift each at a pace of its own, as oscillators of unlike frequencies do",
+        source="Kuramoto, Chemical Oscillations, Waves, and Turbulence (1984), section 5.4",
     ),
     # The instrument.
     Effect("sensor-offset", "1", acts="offset", look_for="a residual that does not change in time", source=LJUNG),

@@ -53,7 +53,7 @@ class OtherCoefficient(OneSite):
 
 
 def alike(texts: Sequence[str], scene: Scene) -> list[str]:
-    """Return the declared terms of a site's own u, or v, as the given terms are."""
-    own = {frozenset(Term(text).names & {"u", "v"}) for text in texts} - {frozenset()}
+    """Return the declared terms of a site's own u, or v, where that is what the given terms are."""
+    own = [{text[0]} for text in texts if text in ("u[n]", "v[n]")]
     declared = ((text, Term(text)) for text in scene.texts if text not in texts)
-    return [text for text, term in declared if term.reach == (0, 0) and frozenset(term.names & {"u", "v"}) in own]
+    return [text for text, term in declared if term.reach == (0, 0) and term.names & {"u", "v"} in own]
