@@ -115,7 +115,7 @@ def share(text: str, digits: int = 0) -> str:
 
 def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings_say() -> None:
     exact = []
-    for folder in ("laboratory", "laboratory-later", "laboratory-third"):
+    for folder in ("laboratory", "laboratory-later", "laboratory-third", "laboratory-fourth"):
         summary = pd.read_csv(RESULTS / "loop" / folder / "summary.csv", comment="#", dtype=str)
         every = summary[summary["by"] == "all"].iloc[0]
         for column in ("right", "residual at most 1.3", "intervals that hold", "forecast worse"):
@@ -152,8 +152,8 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     assert f"those at one time in {share(effects.loc['coefficient-jump', 'named'])}" in words("diagnosis")
     effects = pd.read_csv(RESULTS / "loop" / "jump" / "effects.csv", comment="#", dtype=str).set_index("effect")
     assert effects.loc["sensor-jump", "z 5-10"].startswith("16.7 ")
-    first, later, third = (f"{one.split(' (')[0]} of {one.split()[-1]}" for one in exact)
-    assert f"in {first}, {later} and {third} laboratory recordings" in readme
+    *others, last = (f"{one.split(' (')[0]} of {one.split()[-1]}" for one in exact)
+    assert f"in {', '.join(others)} and {last} laboratory recordings" in readme
 
 
 def test_the_page_on_the_diagnosis_says_what_the_table_of_white_and_slow_noise_says() -> None:
