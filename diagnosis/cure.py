@@ -108,20 +108,21 @@ def _when(factor: object) -> str:
 def corrected(model: Model, samples: Samples, recording: int) -> Samples:
     """Return a recording as instruments without the model's faults would have read it; what is missing stays so.
 
-    A zero that wanders is no number, and stays; so does a lag where no velocities were read. Where a clock jumps, times
-    are corrected.
+    A zero that wanders is no number, and stays; so does a lag where no velocities were read, or of more than a sixth of
+    a period. Where a clock jumps, times are corrected.
 
     Args:
         model: whose instruments are undone.
         samples: the recording.
         recording: its number among those that the model was fitted to.
     """
-    faults = [placed for placed, _ in model.instruments(recording) if placed.quickened() is None]
-    t = samples.t + sum(placed.told(samples.t) - samples.t for placed in faults)
-    faults = [placed for placed in faults if np.array_equal(placed.told(samples.t), samples.t)]
+    both = samples.v is not None and model.order == 2
+    every = [placed for placed, _ in model.instruments(recording) if placed.quickened() is None]
+    lost = sum((placed.told(samples.t) - samples.t for placed in every), np.zeros(len(samples.t)))
+    t = samples.t + lost if np.all(np.diff(samples.t + lost) > 0) else samples.t
+    faults = [one for one in every if not one.stays(velocities=both) and np.array_equal(one.told(samples.t), samples.t)]
     if not faults:
         return replace(samples, t=t)
-    both = samples.v is not None and model.order == 2
     fields = [samples.u, samples.v] if both and samples.v is not None else [samples.u]
     read = np.stack([split_parts(one, samples.is_complex) for one in fields], axis=1)
     field = read.copy()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis.acceleration import with_rates
 from latticebench.diagnosis.fitting import Fitted, fit
 from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.model import Model
@@ -211,7 +212,7 @@ def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Predi
             past.learn(float(end), state)
         whole = problem.plain.whole(np.stack(found), record.stretches.driven(late, problem.splines[number]))
         instruments = [placed for placed, _ in model.instruments(number)]
-        predicted = whole[:, 0] + read_by(instruments, late, whole).added[:, 0]
+        predicted = whole[:, 0] + read_by(instruments, late, with_rates(late[None], whole)).added[:, 0]
         # Nothing is likelier of a zero that wanders than that it stays where it is.
         predicted += again.zeros(number)[0]
         seen = split_parts(samples.u[cut : cut + MOST_ROWS], samples.is_complex)

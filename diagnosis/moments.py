@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 BESIDE = (-5.0, -2.5, 2.5, 5.0)
 
 
-def beside(fitted: Fitted) -> Iterator[tuple[Model, tuple[Float[ndarray, "pieces m state"], ...]]]:
+def beside(fitted: Fitted) -> Iterator[tuple[Model, list[Float[ndarray, "pieces m state"]]]]:
     """Yield a model with what happens sharply a little earlier or later, with states to start from.
 
     Of what happens to readings between two of them, it hardly matters when: a fit that came there does not leave.
@@ -29,4 +29,4 @@ def beside(fitted: Fitted) -> Iterator[tuple[Model, tuple[Float[ndarray, "pieces
             for widths in BESIDE:
                 moved = replace(placed, at=placed.at + widths * placed.wide)
                 if moved.possible:
-                    yield fitted.model.without(number).with_effect(moved), fitted.followed.nodes
+                    yield fitted.model.without(number).with_effect(moved), list(fitted.followed.nodes)

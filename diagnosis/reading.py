@@ -30,8 +30,8 @@ def read_by(instruments: Sequence[Placed], t: ndarray, field: Float[ndarray, "ro
     seen = field if first is None else field + first.added
     rest = [one.misread(t, seen) for one in instruments if not isinstance(one, Late)]
     added, slope = np.zeros_like(field), np.zeros_like(field)
-    for one in rest:
-        added, slope = added + one.added, slope + one.slope
+    for wrong in rest:
+        added, slope = added + wrong.added, slope + wrong.slope
     by, others, begin = [], iter(rest), 0
     for one in instruments:
         if isinstance(one, Late) and first is not None:

@@ -113,7 +113,7 @@ class Cause(Exhibit):
     def left_out(self) -> tuple[str, ...]:
         """The effects that neither `model` nor `corrected` has: memory, a clock, a zero that wanders.
 
-        Without velocities a lag is one of them.
+        Without velocities a lag is one of them; so is one of more than a sixth of a period.
         """
         unread = any(one.v is None for one in self.recording.samples)
         placed = [one.placed for one in self.result.findings]
@@ -124,7 +124,7 @@ class Cause(Exhibit):
     def corrected(self) -> Recording:
         """The recording as it would read without the offsets, drifts, factors and bends that were found, and lags.
 
-        Lags stay where no velocities were read, see `left_out`.
+        Lags stay where no velocities were read, see `left_out`. Where a clock jumps, times are others than in the file.
         A sensor that always reads the same has no readings in it.
         """
         model, dead = self.result.after.model, self.result.dead

@@ -227,7 +227,8 @@ CATALOGUE: tuple[Effect, ...] = (
     ),
     Effect(
         "bilinear-coupling", "abs(u[n+1]-u[n])-abs(u[n]-u[n-1])", complex_field="", orders=(2,),
-        look_for="springs that are softer when stretched than when pressed, alike at all sizes", source=SHAW,
+        look_for="springs that are softer when stretched than when pressed, or the other way round, at all sizes",
+        source=SHAW,
     ),
     Effect(
         "bond-damping", "v[n+1]+v[n-1]-2*v[n]", orders=(2,), real=True,

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # The width of a jump over the time between two readings: frames are missing between two of those that are left.
 BETWEEN = 0.2
+# A jump of so few readings from the first or the last one may be anything.
+FEW = 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,9 +35,13 @@ class ClockJump(Sudden, Late, acts="clock jump"):
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return times all over the recordings."""
+        """Return times all over a recording.
+
+        Of several recordings, each would have jumps of its own; near unknown ends, what is read drives the chain, too.
+        """
         chain, apart = scene.chain, scene.span / MOST_MIDDLES
-        if not effect.texts(chain.order, chain.is_complex):
+        one = len(scene.recordings) < 2 and len(chain.moving) == chain.sites
+        if not one or not effect.texts(chain.order, chain.is_complex):
             return
         for at in scene.begin + apart * np.arange(1, MOST_MIDDLES):
             yield cls(
@@ -45,8 +51,10 @@ class ClockJump(Sudden, Late, acts="clock jump"):
 
     @property
     def possible(self) -> bool:
-        """Whether it happens within the recording, and no clock goes back by more than the time between readings."""
-        return super().possible and self.strength[0] > -self.least / BETWEEN
+        """Whether it happens well within the recording, and no clock goes back by the time between readings."""
+        step = self.least / BETWEEN
+        within = self.seen[0] + FEW * step < self.at < self.seen[1] - FEW * step
+        return within and self.strength[0] > -step
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return what the number is."""

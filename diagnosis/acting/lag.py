@@ -15,6 +15,9 @@ from latticebench.systems.effects import Effect
 if TYPE_CHECKING:
     from numpy import ndarray
 
+# The angle of the main frequency up to which a lag is undone by velocities.
+MOST_TURNED = 1.0
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Lag(OfSensors, Late, acts="lag"):
@@ -57,8 +60,9 @@ class Lag(OfSensors, Late, acts="lag"):
         return self.site is None or self.strength[0] >= 0
 
     def stays(self, *, velocities: bool) -> bool:
-        """Return whether there are no velocities to undo it with."""
-        return not velocities
+        """Return whether there are no velocities to undo it with, or it turns a swing too far for that."""
+        lags = np.arange(len(self.sites)) * self.strength[0] if self.in_turn else np.array(self.strength)
+        return not velocities or bool(np.max(np.abs(self.omega * lags)) > MOST_TURNED)
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the columns that lag."""

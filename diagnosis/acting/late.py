@@ -48,7 +48,8 @@ def misread_late(effects: Sequence[Late], t: ndarray, field: Float[ndarray, "row
     Args:
         effects: one or more.
         t: times of the rows.
-        field: the motion; where it has no velocity, nothing is late; where it has no rate of it, -omega^2 u is taken.
+        field: the motion. Where it has no velocity, nothing is late; where it has no rate of that, it is taken to swing
+            with omega about its mean.
     """
     shape, omega = (len(t), 1, field.shape[-1]), effects[0].omega
     added, slope = np.zeros_like(field), np.zeros_like(field)
@@ -58,7 +59,7 @@ def misread_late(effects: Sequence[Late], t: ndarray, field: Float[ndarray, "row
     if field.shape[1] == 1:
         return Misreading(added, slope, by, by_rates)
     u, v = field[:, 0], field[:, 1]
-    a = field[:, 2] if field.shape[1] > 2 else -(omega**2) * u
+    a = field[:, 2] if field.shape[1] > 2 else -(omega**2) * (u - _middle(u))
     for level in range(field.shape[1]):
         taus = [tau * (level == 0 or one.velocities) for one, (tau, _) in zip(effects, every, strict=True)]
         tau, begin = np.broadcast_to(sum(taus), shape), 0
@@ -83,3 +84,9 @@ def misread_late(effects: Sequence[Late], t: ndarray, field: Float[ndarray, "row
             slope[:, 1] += cos - 1
             by_rates[:, 1, 1] += by_v
     return Misreading(added, slope, by, by_rates)
+
+
+def _middle(u: Float[ndarray, "rows parts sites"]) -> ndarray:
+    """Return the mean of each site over all rows that were read; 0 where none was."""
+    read = np.isfinite(u)
+    return np.asarray(np.sum(np.where(read, u, 0.0), axis=0) / np.maximum(np.sum(read, axis=0), 1))

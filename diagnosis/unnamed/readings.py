@@ -97,7 +97,7 @@ def _between(problem: Problem) -> Iterator[Misread]:
             yield _misread("another gain of one half", [_scaled((place > 0).astype(float))], both=both)
     if chain.levels > 1 and chain.sites > 3:
         grows, half = _in_time(growing(problem.scene)), (place > 0).astype(float)
-        yield _misread("another clock of one half", [lambda t, field: (grows(t) * half * field[:, -1:], 0.0)])
+        yield _misread("another clock of one half", [lambda t, field: (grows(t) * half * field[:, 1:2], 0.0)])
 
 
 def _misread(said: str, added: Sequence[Reading], here: int | None = None, *, both: bool = False) -> Misread:
@@ -123,7 +123,7 @@ def _times(course: Callable[[ndarray], ndarray]) -> Reading:
 
 
 def _late(course: Callable[[ndarray], ndarray]) -> Reading:
-    return lambda t, field: (course(t) * field[:, -1:], 0.0)
+    return lambda t, field: (course(t) * field[:, 1:2], 0.0)
 
 
 def _scaled(factor: ndarray) -> Reading:
@@ -131,7 +131,7 @@ def _scaled(factor: ndarray) -> Reading:
 
 
 def _rate(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
-    return -field[:, -1:], 0.0
+    return -field[:, 1:2], 0.0
 
 
 def _neighbours(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001

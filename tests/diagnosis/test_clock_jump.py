@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import latticebench as lb
 from latticebench.diagnosis.acting import WAYS
 from latticebench.diagnosis.cure import corrected
 from latticebench.diagnosis.model import Model
+from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.reading import read_by
 from latticebench.diagnosis.repair import diagnose
 from latticebench.systems.effects import CATALOGUE, find
@@ -97,6 +99,34 @@ def test_jumps_add_up_to_one_that_loses_as_much_and_a_gain_acts_on_what_is_late(
     assert np.max(np.abs(plain[away & (t > 7), 0])) > 0.3
 
 
+def test_where_no_rate_of_v_is_known_a_swing_about_another_middle_is_late_as_one_about_zero_is():
+    t = FRAME * np.arange(380)
+    u, v = np.cos(4.2 * t)[:, None, None], -4.2 * np.sin(4.2 * t)[:, None, None]
+    # Over whole periods the mean is the middle.
+    for middle in (0.0, 2.0):
+        read = read_by([jump(0.1, 6.0167)], t, np.stack([middle + u, v], axis=1))
+        late = t > 6.1
+        np.testing.assert_allclose(
+            (u[:, 0, 0] + read.added[:, 0, 0, 0])[late], np.cos(4.2 * (t[late] + 0.1)), atol=2e-3
+        )
+
+
+def test_of_several_recordings_and_near_unknown_ends_no_clock_is_said_to_jump():
+    _, samples = filmed(300)
+    effects = [find("clock-jump")]
+    assert Problem.of(DECLARED, 2, [samples], effects).candidates
+    assert not Problem.of(DECLARED, 2, [samples, samples], effects).candidates
+    assert not Problem.of(DECLARED, 2, [replace(samples, ends="unknown")], effects).candidates
+
+
+def test_times_are_left_alone_where_jumps_together_would_put_them_out_of_order():
+    samples = Samples(FRAME * np.arange(200), np.zeros((200, 3)), source="film", ends="free")
+    back = tuple(jump(-0.9 * FRAME, 100.5 * FRAME + k * 1e-3) for k in range(2))
+    assert all(one.possible for one in back)
+    np.testing.assert_array_equal(corrected(Model(DECLARED, 2, TRUTH, back), samples, 0).t, samples.t)
+    np.testing.assert_allclose(corrected(Model(DECLARED, 2, TRUTH, back[:1]), samples, 0).t, back[0].told(samples.t))
+
+
 def test_no_clock_goes_back_by_more_than_the_time_between_two_readings():
     assert jump(0.1, 3.0).possible
     assert jump(-0.9 * FRAME, 3.0).possible
@@ -110,5 +140,3 @@ def test_a_diagnosis_in_python_gives_the_right_times_and_leaves_nothing_out():
     assert "clock-jump" in {one["effect"] for one in cause.effects.reset_index().to_dict("records")}
     assert cause.left_out == ()
     np.testing.assert_allclose(cause.corrected.samples[0].t, true, atol=0.01)
-    model = Model(DECLARED, 2, TRUTH, ())
-    assert corrected(model, samples, 0) is samples or np.array_equal(corrected(model, samples, 0).t, samples.t)

@@ -82,6 +82,9 @@ def test_every_misreading_without_a_name_has_the_slope_of_what_it_adds(is_comple
         placed = one.moved(draw.normal(size=len(one.strength)))
         found = placed.misread(t, field)
         np.testing.assert_allclose(found.added, np.tensordot(placed.strength, found.by, 1), atol=1e-12)
+        # A motion may have the rate of its velocity with it.
+        more = placed.misread(t, np.concatenate([field, draw.normal(size=field[:, :1].shape)], axis=1))
+        np.testing.assert_array_equal(more.read(chain.levels).added, found.added, err_msg=one.said)
         k = int(draw.integers(chain.sites))
         for level in range(chain.levels):
             for part in range(chain.parts):
