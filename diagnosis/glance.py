@@ -95,6 +95,8 @@ class _Pull:
         """
         together: dict[tuple[bool, str, bytes], list[tuple[Force, InStep | None, int]]] = {}
         for one, begin, end in zip(candidates, ends, ends[1:], strict=False):
+            if not one.acts_in(self.number):
+                continue
             forces = [(force, force.factor) for force in (*one.forces(self.chain), *one.courses(self.chain))]
             in_step = [(force, factor, begin) for force, factor in forces if isinstance(factor, InStep | None)]
             if one.scaled() is not None or one.other_ends() is not None or len(in_step) < len(forces):

@@ -28,26 +28,43 @@ class ClockJump(Sudden, Late, acts="clock jump"):
     """From one time on all readings are of a time later by the strength than they say (`late.misread_late`).
 
     Cameras drop frames where a computer does not keep up: the frames that are left are numbered through.
+
+    Attributes:
+        recording: the number of the only recording, from 0, in which it does so; None where there is one.
     """
 
+    recording: int | None = None
     velocities: ClassVar[bool] = True
     separated_by: ClassVar[str] = "a second clock in the picture, or the times that the camera writes itself"
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return times all over a recording.
+        """Return times all over the recordings, in each of several.
 
-        Of several recordings, each would have jumps of its own; near unknown ends, what is read drives the chain, too.
+        Near unknown ends, what is read late drives the chain, too: none.
         """
         chain, apart = scene.chain, scene.span / MOST_MIDDLES
-        one = len(scene.recordings) < 2 and len(chain.moving) == chain.sites
-        if not one or not effect.texts(chain.order, chain.is_complex):
+        if len(chain.moving) < chain.sites or not effect.texts(chain.order, chain.is_complex):
             return
-        for at in scene.begin + apart * np.arange(1, MOST_MIDDLES):
-            yield cls(
-                effect=effect, strength=(0.0,), at=float(at), width=apart / 2, least=BETWEEN * scene.step,
-                seen=scene.seen, omega=scene.main,
-            )  # fmt: skip
+        for recording in range(len(scene.recordings)) if len(scene.recordings) > 1 else (None,):
+            for at in scene.begin + apart * np.arange(1, MOST_MIDDLES):
+                yield cls(
+                    effect=effect, strength=(0.0,), at=float(at), width=apart / 2, least=BETWEEN * scene.step,
+                    seen=scene.seen, omega=scene.main, recording=recording,
+                )  # fmt: skip
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect and the recording."""
+        return (self.effect.name, self.recording)
+
+    def acts_in(self, recording: int) -> bool:
+        """Return whether it is there in a recording."""
+        return self.recording in (None, recording)
+
+    def settings(self) -> dict[str, float | int | str]:
+        """Return when it happens, and the recording, from 1, where there are several."""
+        return super().settings() | ({} if self.recording is None else {"recording": self.recording + 1})
 
     @property
     def possible(self) -> bool:
@@ -58,7 +75,9 @@ class ClockJump(Sudden, Late, acts="clock jump"):
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return what the number is."""
-        return ("time that the clock loses",)
+        return (
+            "time that the clock loses" + ("" if self.recording is None else f" in recording {self.recording + 1}"),
+        )
 
     def courses(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return the velocity from the jump on and, for time and width, its derivatives by them; to first order."""

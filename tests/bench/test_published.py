@@ -137,6 +137,9 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     assert f"and {share(still['unexplained'])} were `unexplained` or partly so" in words("diagnosis")
     lag = pd.read_csv(RESULTS / "loop" / "lag" / "summary.csv", comment="#", dtype=str)
     assert f"`results/loop/lag`): {share(lag['right'].iloc[0])}." in words("diagnosis")
+    later = pd.read_csv(RESULTS / "loop" / "lag-later" / "summary.csv", comment="#", dtype=str).iloc[0]
+    assert f"effect was named and no other in {share(later['right'])}, and intervals" in words("diagnosis")
+    assert f"intervals hold the true size in {share(later['intervals that hold'])}." in words("diagnosis")
     lens = pd.read_csv(RESULTS / "loop" / "lens" / "summary.csv", comment="#", dtype=str)
     assert f"`results/loop/lens`): {share(lens['right'].iloc[0])}." in words("diagnosis")
     jump = pd.read_csv(RESULTS / "loop" / "jump" / "summary.csv", comment="#", dtype=str)
