@@ -11,6 +11,8 @@ import numpy as np
 from latticebench.diagnosis.acting.one_site import alike
 from latticebench.diagnosis.acting.placed import Chain, Force, Placed, Scene
 from latticebench.systems.effects import Effect
+from latticebench.systems.stencil import evaluate
+from latticebench.systems.terms import Term
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -29,8 +31,13 @@ class EverySite(Placed, acts="every site"):
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return the formula and its like, on a chain of at least three sites: with fewer, one site can be named."""
+        """Return the formula and its like, on a chain of at least three sites: with fewer, one site can be named.
+
+        Where all declared terms are linear, constants do what the sensors' offsets do: none.
+        """
         texts, chain = scene.terms(effect), scene.chain
+        if texts == ("1",) and _linear(scene):
+            return
         if texts and len(chain.moving) > 2 and len(chain.moving) == chain.sites:
             whole = not set(texts) <= set(scene.texts)
             yield cls(
@@ -75,3 +82,15 @@ class OtherCoefficients(EverySite):
     def place(self) -> tuple[object, ...]:
         """The effect and its term."""
         return (self.effect.name, *self.texts)
+
+
+def _linear(scene: Scene) -> bool:
+    """Return whether all declared terms of a real lattice of first order add up as fields do."""
+    terms, zero = [Term(text) for text in scene.texts], np.zeros((1, scene.chain.sites))
+    place = np.arange(scene.chain.sites)
+
+    def values(u: np.ndarray) -> np.ndarray:
+        return np.asarray(evaluate(terms, u[None], None, zero, np.zeros(1), ends=scene.chain.ends))
+
+    one, two = np.cos(1.3 * place + 0.4), np.sin(0.7 * place**2 + 0.2)
+    return bool(np.allclose(values(one + two), values(one) + values(two)))

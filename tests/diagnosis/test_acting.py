@@ -324,6 +324,14 @@ MOVING = [pair for pair in EVERY_WAY if not WAYS[pair[0]].instrument and pair[0]
 READING = [pair for pair in EVERY_WAY if WAYS[pair[0]].instrument and pair[0] not in (*UNSAID, "wander", "clock jump")]
 
 
+def test_rates_of_each_sites_own_are_looked_for_where_offsets_of_sensors_do_not_do_the_same() -> None:
+    t = np.linspace(0, 10, 101)
+    samples = Samples(t, np.cos(t[:, None] + np.arange(4)) + 0.1 * t[:, None], ends="free")
+    for declared, there in ((COUPLING, 0), ("sin(u[n+1]-u[n])+sin(u[n-1]-u[n])", 1)):
+        problem = Problem.of(library("own", declared), 1, [samples], [find("own-rates")])
+        assert len(problem.candidates) == there
+
+
 def forces(dynamics: Dynamics, coefficients: np.ndarray, is_complex: bool) -> np.ndarray:
     """The right-hand side at a few states and times."""
     draw, t = np.random.default_rng(1), np.array([0.7, 3.0, 9.1])

@@ -179,7 +179,8 @@ def test_a_fault_is_for_lattices_that_can_have_it():
 
 
 def test_every_effect_of_the_catalogue_can_be_made():
-    assert {one.name for one in CATALOGUE} <= set(FAULTS)
+    # No lattice of the paper is real and of first order.
+    assert {one.name for one in CATALOGUE} - {"own-rates"} <= set(FAULTS)
 
 
 def test_an_unknown_effect_is_refused_by_name():
