@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from latticebench.systems.samples import Samples
     from latticebench.systems.stencil import Ends
 
-# Newton's steps to the field whose reading is known; instruments are nearly linear.
-STEPS = 20
+# Steps to the field whose reading is known. Instruments are nearly linear; where sensors hear others, what is left of
+# them falls at least by half with each.
+STEPS = 50
 # A text that needs no brackets in a product.
 SIMPLE = re.compile(r"|[uvf]\[n(?:[+-]\d+)?\](?:\*\*\d+)?")
 # Digits of a weight or a number of time within a term.

@@ -83,8 +83,8 @@ class _Pull:
     def __init__(self, tangent: Tangent, number: int, readings: ndarray) -> None:
         self.tangent, self.number = tangent, number
         self.t, self.chain = tangent.along[number].t, tangent.fitted.chain
-        chain, (own, by_rates) = self.chain, tangent.slopes(number)
-        self.dual = _dual(tangent, number, readings * own[..., None], _by_rates(readings, by_rates))
+        chain = self.chain
+        self.dual = _dual(tangent, number, *tangent.sensitivity(number).back(readings))
         self.readings = readings.reshape(len(self.t), chain.levels, chain.parts, chain.sites, -1)[:, 0]
         self.courses: dict[InStep | None, ndarray] = {}
 
@@ -142,17 +142,6 @@ def _looked(tangent: Tangent) -> list[ndarray]:
     readings = tangent.whitener.transposed(looked.reshape(*shape, -1) * tangent.robust[..., None])
     ends = np.cumsum([rows.size for rows in layout.rows])
     return np.split(readings, ends[:-1])
-
-
-def _by_rates(readings: ndarray, by_rates: ndarray | None) -> ndarray | None:
-    """Return derivatives by v and its rate from those by the readings (rows, channels, 1 + D).
-
-    They have the shape (rows, 2, parts, N, 1 + D).
-    """
-    if by_rates is None:
-        return None
-    levels = readings.reshape(*by_rates.shape[:2], 1, *by_rates.shape[3:], -1)
-    return np.asarray(np.sum(levels * by_rates[..., None], axis=1))
 
 
 def _dual(tangent: Tangent, number: int, readings: ndarray, rates: ndarray | None) -> ndarray:

@@ -22,7 +22,7 @@ from latticebench.diagnosis.border import Border, borders
 from latticebench.diagnosis.model import Assembled, Model
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.propagation import propagate
-from latticebench.diagnosis.reading import is_late, read_by
+from latticebench.diagnosis.reading import Sensitivity, is_late, read_by
 from latticebench.diagnosis.rows import Rows
 from latticebench.methods.engine.dynamics import Dynamics
 from latticebench.methods.engine.record import Record
@@ -232,9 +232,7 @@ class Path:
         splines: coefficients of the curves of the sites without an equation.
         level: the model's readings, rows of all recordings one after another (rows, channels).
         left: readings less that, NaN where nothing was read.
-        own: derivatives of the readings by the field (rows, channels).
-        by_rates: those by v and its rate, of all recordings one after another (rows, levels, 2, parts, N), but for
-            those by its own field; None for 0.
+        sensitivity: derivatives of the readings by the motion.
     """
 
     model: Model
@@ -242,8 +240,7 @@ class Path:
     splines: tuple[ndarray | None, ...]
     level: Float[ndarray, "rows channels"]
     left: Float[ndarray, "rows channels"]
-    own: Float[ndarray, "rows channels"]
-    by_rates: Float[ndarray, "rows levels 2 parts sites"] | None
+    sensitivity: Sensitivity
 
     @property
     def size(self) -> int:
@@ -274,7 +271,7 @@ class Followed(Path):
     @property
     def path(self) -> Path:
         """The motion alone."""
-        return Path(self.model, self.nodes, self.splines, self.level, self.left, self.own, self.by_rates)
+        return Path(self.model, self.nodes, self.splines, self.level, self.left, self.sensitivity)
 
     @property
     def local(self) -> int:
@@ -330,8 +327,8 @@ def linearised(path: Path, layout: Layout) -> Followed | None:
         return None
     slope = _slopes(path, layout, moves)
     return Followed(
-        path.model, path.nodes, path.splines, path.level, path.left, path.own, path.by_rates, tuple(moves),
-        tuple(transitions), slope,
+        path.model, path.nodes, path.splines, path.level, path.left, path.sensitivity, tuple(moves), tuple(transitions),
+        slope,
     )  # fmt: skip
 
 
@@ -418,29 +415,24 @@ def fields(
 
 def _readings(
     model: Model, layout: Layout, nodes: Sequence[ndarray], splines: Sequence[ndarray | None]
-) -> tuple[ndarray, ndarray, ndarray, ndarray | None]:
-    """Return what instruments make of a motion, what that leaves of the readings, and its derivatives; see `Path`."""
-    levels, lefts, owns, rates = [], [], [], []
+) -> tuple[ndarray, ndarray, Sensitivity]:
+    """Return what instruments make of a motion, what that leaves of the readings, and its derivatives."""
+    levels, lefts, sensitivities = [], [], []
     for number, record in enumerate(layout.records):
         rows = layout.rows[number]
         t, field = fields(layout, number, nodes[number], splines[number])
         level = field[:, : layout.chain.levels]
-        own, rate = np.ones_like(level), np.zeros((*level.shape[:2], 2, *level.shape[2:]))
+        sensitivity = Sensitivity(np.ones_like(level))
         if instruments := [placed for placed, _ in model.instruments(number)]:
             field = with_rates(layout.records[number].times[rows], field) if is_late(instruments) else field
             wrong = read_by(instruments, t, field).read(layout.chain.levels)
-            level, own = level + wrong.added, own + wrong.slope
-            rate = rate if wrong.by_rates is None else wrong.by_rates
+            level, sensitivity = level + wrong.added, Sensitivity.of(wrong)
         seen = record.seen[rows] & layout.valid[number][..., None, None, None]
         value = np.where(seen, record.value[rows], np.nan).reshape(level.shape)
-        shape = (rows.size, -1)
-        levels.append(level.reshape(shape))
-        lefts.append((value - level).reshape(shape))
-        owns.append(own.reshape(shape))
-        rates.append(rate)
-    by_rates = np.concatenate(rates)
-    level, left, own = (np.concatenate(one) for one in (levels, lefts, owns))
-    return level, left, own, by_rates if np.any(by_rates) else None
+        levels.append(level.reshape(rows.size, -1))
+        lefts.append((value - level).reshape(rows.size, -1))
+        sensitivities.append(sensitivity)
+    return np.concatenate(levels), np.concatenate(lefts), Sensitivity.along(sensitivities)
 
 
 def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
@@ -450,17 +442,17 @@ def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
         t, field = fields(layout, number, path.nodes[number], path.splines[number])
         count, size = moves[number].shape[2:]
         flat = moves[number].reshape(rows.size, count, size)
-        by_field, some = layout.plain.whole(flat, None), slice(begin, begin + rows.size)
+        by_field, sensitivity = layout.plain.whole(flat, None), path.sensitivity.at(slice(begin, begin + rows.size))
+        begin += rows.size
         by = np.moveaxis(by_field[:, :, : layout.chain.levels], 1, -1)
         border = layout.borders[number]
         if border is not None:
             times = layout.records[number].times[rows]
             border.add_readings(by[..., size : size + border.size], times, layout.plain.border)
-        if path.by_rates is not None:
+        if sensitivity.by_rates is not None:
             times = layout.records[number].times[rows]
             field, by_field = with_rates(times, field), with_rates(times, by_field)
-        by = as_read(by, by_field, path.own[some], None if path.by_rates is None else path.by_rates[some])
-        begin += rows.size
+        by = sensitivity.forward(by, by_field)
         if instruments := path.model.instruments(number):
             wrong = read_by([one for one, _ in instruments], t, field).read(layout.chain.levels)
             own = count - len(path.model.numbers)
@@ -468,21 +460,3 @@ def _slopes(path: Path, layout: Layout, moves: Sequence[ndarray]) -> ndarray:
             by[..., numbers] += np.moveaxis(wrong.by, 0, -1).reshape(rows.size, by.shape[1], -1)
         found.append(by)
     return np.concatenate(found)
-
-
-def as_read(
-    by: Float[ndarray, "rows levels parts sites count"], by_field: ndarray, own: ndarray, by_rates: ndarray | None
-) -> Float[ndarray, "rows channels count"]:
-    """Return derivatives of readings from those of what is read.
-
-    Args:
-        by: derivatives of the levels that are read.
-        by_field: the same of the motion (rows, count, levels, parts, N).
-        own: derivatives of the readings by their fields, see `Path`.
-        by_rates: those by v and its rate; the motion has this level then, too.
-    """
-    found: ndarray = by.reshape(*own.shape, -1) * own[..., None]
-    if by_rates is not None:
-        moving = np.moveaxis(by_field[:, :, 1:], 1, -1)[:, None]
-        found += np.sum(by_rates[..., None] * moving, axis=2).reshape(found.shape)
-    return found

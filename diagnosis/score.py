@@ -17,11 +17,11 @@ import numpy as np
 from latticebench.diagnosis.acceleration import with_rates
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted, gain, left_free, whitened
-from latticebench.diagnosis.horizon import as_read, fields
+from latticebench.diagnosis.horizon import fields
 from latticebench.diagnosis.model import Assembled, Model, read_term
 from latticebench.diagnosis.normal import by_pieces, normal, scaled_inverse
 from latticebench.diagnosis.propagation import propagate
-from latticebench.diagnosis.reading import seen_by
+from latticebench.diagnosis.reading import Sensitivity, seen_by
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -317,11 +317,11 @@ class Tangent:
         forces = [one for one in batch if not one.instrument]
         if forces:
             z = self._moved(number, forces)
-            field, (own, by_rates) = layout.plain.whole(z, None), self.slopes(number)
+            field, sensitivity = layout.plain.whole(z, None), self.sensitivity(number)
             by = field[:, :, : chain.levels]
-            if by_rates is not None:
+            if sensitivity.by_rates is not None:
                 field = with_rates(layout.records[number].times[rows], field)
-            blocks.append(as_read(np.moveaxis(by, 1, -1), field, own, by_rates))
+            blocks.append(sensitivity.forward(np.moveaxis(by, 1, -1), field))
         for one in batch:
             if one.instrument:
                 by = one.misread(along.t, along.field).read(chain.levels).by
@@ -341,11 +341,10 @@ class Tangent:
         z = propagate(self.followed.transitions[number], forced, still)
         return z.reshape(rows.size, len(push), -1)
 
-    def slopes(self, number: int) -> tuple[ndarray, ndarray | None]:
-        """Return the derivatives of one recording's readings by their own fields, v and its rate; `horizon.Path`."""
-        begin, followed = sum(rows.size for rows in self.fitted.layout.rows[:number]), self.fitted.followed
-        some = slice(begin, begin + self.fitted.layout.rows[number].size)
-        return followed.own[some], None if followed.by_rates is None else followed.by_rates[some]
+    def sensitivity(self, number: int) -> Sensitivity:
+        """Return the derivatives of one recording's readings by the motion."""
+        begin = sum(rows.size for rows in self.fitted.layout.rows[:number])
+        return self.fitted.followed.sensitivity.at(slice(begin, begin + self.fitted.layout.rows[number].size))
 
     def push(self, number: int, one: Placed) -> ndarray:
         """Return the forces of an effect's numbers, or of one without any, along the motion: (., rows, parts, M)."""

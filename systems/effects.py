@@ -44,8 +44,12 @@ HOW: dict[str, str] = {
     "gain": "the reading is g u; at one site, which is found, with a g for every site, or "
     "with one for all in a recording",
     "curve": "the reading is u + c T(u), T being a power, with one c for all sensors or at one of them",
+    "gain drift": "the reading is (1 + c (t - t_0) / T) u, T being the recording's length; at one site, which is found",
+    "crosstalk": "the reading is u + c times u of the sensors next to it, of the one on one side, or the mean of all",
+    "imbalance": "the reading of a complex field is z + c conj(z), with one c for all sites",
     "lag": "the reading is u a time tau ago; at one site, which is found, with a tau for every site, or with one more "
     "tau at each",
+    "sensor clock": "the reading is u at a time that is late by c (t - t_0); at one site, or from one on",
     "clock": "the recorded times are wrong by a share of themselves",
     "clock jump": "from one time on readings are of a later time than they say; time found",
 }
@@ -329,6 +333,21 @@ CATALOGUE: tuple[Effect, ...] = (
     ),
     Effect("sensor-gain", "u[n]", acts="gain", look_for="a residual in proportion to one site's reading", source=LJUNG),
     Effect(
+        "sensor-gain-drift", "t*u[n]", acts="gain drift",
+        look_for="a residual in proportion to one site's reading, more and more so",
+        source=LJUNG,
+    ),
+    Effect(
+        "sensor-imbalance", "", complex_field="conj(u[n])", acts="imbalance",
+        look_for="a residual that turns against the field, as of receivers whose two quadratures differ",
+        source="Razavi, RF Microelectronics (2011), section 4.2",
+    ),
+    Effect(
+        "sensor-crosstalk", "u[n+1]+u[n-1]", complex_field="u[n+1]+u[n-1]", acts="crosstalk", real=True,
+        look_for="a residual in proportion to the readings beside", source="Ott, Electromagnetic Compatibility "
+        "Engineering (2009), chapter 2",
+    ),
+    Effect(
         "sensor-curve", "u[n]**2", complex_field="abs(u[n])*u[n]", acts="curve",
         look_for="a residual in proportion to the square of the reading", source=LJUNG,
     ),
@@ -340,6 +359,11 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "sensor-lag", "v[n]", acts="lag", orders=(2,),
         look_for="a residual in proportion to the velocity at one site, as of a filter or of channels that are scanned",
+        source=LJUNG,
+    ),
+    Effect(
+        "sensor-clock", "t*v[n]", acts="sensor clock", orders=(2,),
+        look_for="one sensor that falls behind, or runs ahead, as where each logger has a clock of its own",
         source=LJUNG,
     ),
     Effect(

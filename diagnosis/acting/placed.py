@@ -166,17 +166,21 @@ class Misreading:
         slope: its derivative by the reading's own field, likewise; dimensionless.
         by: its derivatives by the numbers of the effect (numbers, rows, levels, parts, N).
         by_rates: those by v and its rate (rows, levels, 2, parts, N), but for the reading's own field; None for 0.
+        by_others: those by the same field at other sites, or of the other part, a row for each reading (levels,
+            parts * N, parts * N); None for 0.
     """
 
     added: Float[ndarray, "rows levels parts sites"]
     slope: Float[ndarray, "rows levels parts sites"]
     by: Float[ndarray, "numbers rows levels parts sites"]
     by_rates: Float[ndarray, "rows levels 2 parts sites"] | None = None
+    by_others: Float[ndarray, "levels channels channels"] | None = None
 
     def read(self, levels: int) -> Misreading:
         """Return what concerns the levels that were read."""
         by_rates = None if self.by_rates is None else self.by_rates[:, :levels]
-        return Misreading(self.added[:, :levels], self.slope[:, :levels], self.by[:, :, :levels], by_rates)
+        by_others = None if self.by_others is None else self.by_others[:levels]
+        return Misreading(self.added[:, :levels], self.slope[:, :levels], self.by[:, :, :levels], by_rates, by_others)
 
 
 @dataclass(frozen=True, eq=False)

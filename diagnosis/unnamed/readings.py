@@ -1,4 +1,4 @@
-"""Errors of instruments without a name: what a sensor adds to its reading, and what all of them have in common."""
+"""Errors of instruments without a name: what sensors add to their readings, and what they have in common."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from latticebench.diagnosis.acting import Misreading
-from latticebench.diagnosis.unnamed.course import Course, courses, growing
+from latticebench.diagnosis.unnamed.course import Course, courses
 from latticebench.diagnosis.unnamed.nameless import EFFECT, Nameless
 
 if TYPE_CHECKING:
@@ -46,22 +46,18 @@ class Misread(Nameless):
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:
         """Return what the errors add."""
-        sites = slice(None) if self.here is None else self.here
         levels = slice(None) if self.both else slice(0, 1)
         by, slope = np.zeros((len(self.added), *field.shape)), np.zeros_like(field)
         for k, (one, strength) in enumerate(zip(self.added, self.strength, strict=True)):
             added, own = one(t, field)
-            by[k, :, levels, :, sites] = np.broadcast_to(added, field.shape)[:, levels, :, sites]
-            slope[:, levels, :, sites] += strength * np.broadcast_to(own, field.shape)[:, levels, :, sites]
+            by[k, :, levels] = np.broadcast_to(added, field.shape)[:, levels]
+            slope[:, levels] += strength * np.broadcast_to(own, field.shape)[:, levels]
         return Misreading(np.tensordot(self.strength, by, 1), slope, by)
 
 
 def readings(problem: Problem) -> Iterator[Misread]:
-    """Yield errors of single sensors, of all in common, and between sensors."""
+    """Yield errors of all sensors in common, and between sensors."""
     chain = problem.chain
-    grows = _in_time(growing(problem.scene))
-    for here in range(chain.sites):
-        yield _misread("a gain that drifts", [_times(grows)], here)
     if chain.levels > 1:
         yield _misread("readings that lag", [_rate])
     yield from _between(problem)
@@ -69,8 +65,6 @@ def readings(problem: Problem) -> Iterator[Misread]:
     for count in FRINGES:
         yield _misread(f"an error of {count} fringes", [_fringe(np.pi * count / largest, phase) for phase in (0, 1)])
     yield _misread("readings clipped above", [_beyond(share * largest) for share in CLIPPED])
-    if chain.is_complex:
-        yield _misread("unequal gains of both parts", [_conjugate])
     rows = max(len(one.t) for one in problem.data)
     for number in sorted({min(one, rows // 2) for one in COURSES}):
         if number >= COURSES[0]:
@@ -83,26 +77,19 @@ def readings(problem: Problem) -> Iterator[Misread]:
 
 
 def _between(problem: Problem) -> Iterator[Misread]:
-    """Yield errors that sensors share with others: of neighbours, of the one before, of the mean, along the chain."""
+    """Yield errors that sensors share with others along the chain."""
     chain = problem.chain
-    if chain.sites < 2:
+    if chain.sites < 4:
         return
     place = (np.arange(chain.sites) - (chain.sites - 1) / 2) / ((chain.sites - 1) / 2)
     for both in (False, True)[: chain.levels]:
-        yield _misread("readings that hold some of their neighbours'", [_neighbours], both=both)
-        yield _misread("readings that hold some of the one before", [_before], both=both)
-        yield _misread("readings against their mean", [_mean], both=both)
-        if chain.sites > 3:
-            yield _misread("gains that grow along the chain", [_scaled(place)], both=both)
-            yield _misread("another gain of one half", [_scaled((place > 0).astype(float))], both=both)
-    if chain.levels > 1 and chain.sites > 3:
-        grows, half = _in_time(growing(problem.scene)), (place > 0).astype(float)
-        yield _misread("another clock of one half", [lambda t, field: (grows(t) * half * field[:, 1:2], 0.0)])
+        yield _misread("gains that grow along the chain", [_scaled(place)], both=both)
+        yield _misread("another gain of one half", [_scaled((place > 0).astype(float))], both=both)
 
 
-def _misread(said: str, added: Sequence[Reading], here: int | None = None, *, both: bool = False) -> Misread:
+def _misread(said: str, added: Sequence[Reading], *, both: bool = False) -> Misread:
     return Misread(
-        effect=EFFECT, said=said, added=tuple(added), here=here, both=both, strength=(0.0,) * len(added)
+        effect=EFFECT, said=said, added=tuple(added), both=both, strength=(0.0,) * len(added)
     )  # fmt: skip
 
 
@@ -132,28 +119,6 @@ def _scaled(factor: ndarray) -> Reading:
 
 def _rate(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
     return -field[:, 1:2], 0.0
-
-
-def _neighbours(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
-    added = np.zeros_like(field)
-    added[..., 1:] += field[..., :-1]
-    added[..., :-1] += field[..., 1:]
-    return added, 0.0
-
-
-def _before(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
-    added = np.zeros_like(field)
-    added[..., 1:] = field[..., :-1]
-    return added, 0.0
-
-
-def _mean(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
-    return np.mean(field, axis=-1, keepdims=True), 1 / field.shape[-1]
-
-
-def _conjugate(t: ndarray, field: ndarray) -> tuple[ndarray, ndarray]:  # noqa: ARG001
-    sign = np.array([1.0, -1.0])[:, None]
-    return sign * field, sign
 
 
 def _fringe(angle: float, phase: int) -> Reading:

@@ -97,6 +97,10 @@ MISREADINGS = {
     "sensor-wander": _misread(instrument.wander),
     "sensor-hum": _misread(instrument.humming),
     "sensor-lag": replace(_misread(instrument.slow), only="second order"),
+    "sensor-gain-drift": _misread(instrument.fading),
+    "sensor-crosstalk": _misread(instrument.crosstalk),
+    "sensor-imbalance": replace(_misread(instrument.unbalanced), only="complex"),
+    "sensor-clock": replace(_misread(instrument.own_clock), only="second order"),
     "clock-jump": replace(_misread(instrument.dropped), only="second order"),
     # Where only u is read, another unit of time does the same.
     "clock": replace(_misread(instrument.slow_clock), only="second order"),

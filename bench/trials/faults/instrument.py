@@ -31,6 +31,12 @@ def gain(setting: Setting, size: float) -> Fields:
     return _with_scale(setting.run(), 1 + size * setting.one)
 
 
+def fading(setting: Setting, size: float) -> Fields:
+    """Let the gain of one sensor change steadily, by the size over the record."""
+    along = (setting.times - setting.times[0]) / (setting.times[-1] - setting.times[0])
+    return _with_scale(setting.run(), 1 + size * along[:, None] * setting.one)
+
+
 def curve(setting: Setting, size: float) -> Fields:
     """Bend the scale: u + size u^2, of a complex field u + size |u| u."""
     u, v = setting.run()
@@ -74,6 +80,14 @@ def slow_clock(setting: Setting, size: float) -> Fields:
     """Read each row late by a share of the time since the first."""
     begin = setting.times[0]
     return setting.at(begin + (1 + size) * (setting.times - begin)).run()
+
+
+def own_clock(setting: Setting, size: float) -> Fields:
+    """Read one site of u by a clock that is slow by the size, and right at the start."""
+    begin = setting.times[0]
+    u, v = setting.run()
+    late, _ = setting.at(begin + (1 - size) * (setting.times - begin)).run()
+    return u + (late - u) * setting.one, v
 
 
 def dropped(setting: Setting, size: float) -> Fields:

@@ -1,0 +1,66 @@
+"""A sensor whose gain drifts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, OfSensors, Placed, Scene
+from latticebench.systems.effects import Effect
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GainDrift(OfSensors, acts="gain drift"):
+    """The reading is (1 + c (t - t_0) / T) u, T being the length of the longest recording.
+
+    Attributes:
+        begin, span: t_0 and T.
+        both: whether velocities are read so, too.
+    """
+
+    begin: float
+    span: float
+    both: bool
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return every site of several: what all gains have in common is damping, nearly."""
+        chain = scene.chain
+        if chain.sites < 2 or not effect.texts(chain.order, chain.is_complex):
+            return
+        for both in (False, True)[: chain.levels]:
+            for site in range(chain.sites):
+                yield cls(
+                    effect=effect, sites=(site,), begin=scene.begin, span=scene.span, both=both, strength=(0.0,)
+                )  # fmt: skip
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect, the site, and whether velocities are concerned."""
+        return (*super().place, self.both)
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:
+        """Return the columns whose gain drifts."""
+        site = self.sites[0] + 1
+        column = f"re{site} and im{site}" if chain.is_complex else f"u{site}" + (f" and v{site}" if self.both else "")
+        return (f"drift of the gain of {column}",)
+
+    def misread(self, t: ndarray, field: ndarray) -> Misreading:
+        """Return what the gain adds."""
+        by, slope = np.zeros((1, *field.shape)), np.zeros_like(field)
+        levels, site = slice(None) if self.both else slice(0, 1), self.sites[0]
+        grown = ((t - self.begin) / self.span)[:, None, None]
+        by[0, :, levels, :, site] = grown * field[:, levels, :, site]
+        slope[:, levels, :, site] = self.strength[0] * grown
+        return Misreading(self.strength[0] * by[0], slope, by)
+
+    def sentences(self, chain: Chain) -> list[str]:
+        """Return how much the gain changes."""
+        pairs = zip(self.labels(chain), self.strength, strict=True)
+        return [f"{label}: {value:.{DIGITS}g} over the recording" for label, value in pairs]

@@ -1,0 +1,72 @@
+"""A sensor whose clock is fast or slow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from latticebench.diagnosis.acting.lag import MOST_TURNED
+from latticebench.diagnosis.acting.late import Late
+from latticebench.diagnosis.acting.placed import OfSensors, Placed, Scene
+from latticebench.systems.effects import Effect
+
+if TYPE_CHECKING:
+    from numpy import ndarray
+
+    from latticebench.diagnosis.acting.placed import Chain
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SensorClock(OfSensors, Late, acts="sensor clock"):
+    """The reading is u at a time that is late by strength * (t - t_0) (`late.misread_late`).
+
+    Loggers that were started together have clocks of their own. Where they were not, there is a lag, too.
+
+    Attributes:
+        begin, span: t_0, and the length of the longest recording.
+    """
+
+    begin: float
+    span: float
+
+    @classmethod
+    def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
+        """Return each sensor of several, and all from one on; sites without an equation are taken to be on time."""
+        chain = scene.chain
+        if chain.sites < 2 or not effect.texts(chain.order, chain.is_complex):
+            return
+        single = [(site,) for site in chain.moving]
+        later = [chain.moving[k:] for k in range(1, len(chain.moving) - 1)]
+        for sites in (*single, *later):
+            yield cls(effect=effect, sites=sites, begin=scene.begin, span=scene.span, omega=scene.main, strength=(0.0,))
+
+    def stays(self, *, velocities: bool) -> bool:
+        """Return whether there are no velocities to undo it with, or it turns a swing too far for that."""
+        return not velocities or abs(self.omega * self.strength[0]) * self.span > MOST_TURNED
+
+    def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
+        """Return whose clock it is."""
+        first, last = self.sites[0] + 1, self.sites[-1] + 1
+        return (f"delay of u{first}" + (f" to u{last}" if last > first else "") + " per time",)
+
+    def lateness(self, t: ndarray, sites: int) -> tuple[ndarray, ndarray]:
+        """Return how late each sensor is, and the derivative by the number."""
+        late = (t - self.begin)[:, None, None] * np.isin(np.arange(sites), self.sites)
+        return self.strength[0] * late, late[None]
+
+    def natural(self, chain: Chain, frequency: float) -> dict[str, float]:  # noqa: ARG002
+        """Return how much slower the clock is, in per cent."""
+        return {f"per cent by which {self._clock} slow": 100 * self.strength[0]}
+
+    @property
+    def _clock(self) -> str:
+        names = f"u{self.sites[0] + 1}" + (f" to u{self.sites[-1] + 1}" if len(self.sites) > 1 else "")
+        return f"the clock of {names} is"
+
+    def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
+        """Return how fast or slow the clock is."""
+        slow = self.strength[0]
+        return [f"{self._clock} {abs(100 * slow):.4g} % {'slow' if slow > 0 else 'fast'}"]
