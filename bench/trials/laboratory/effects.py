@@ -3,8 +3,10 @@
 Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
 "cos", "sin" and "omega" (of a drive, at all sites or at one, or of a sensor's hum), "offset_2", "gain_2", "curve_2",
 "lag_2" and "jump_2" (of the second sensor, which reads gain * u + offset + curve * u^2 of a time lag ago, and from the
-time "when" on jump more), "curve" and "cubic" (one for all, the latter of u^3), "bond_2" (from the second site on), and
-"ramp of u[n]" (how fast that coefficient changes) and "step of u[n]" (by how much it does, at "when").
+time "when" on jump more), "fade_2" (by how much its gain grows over the recording), "slow_2" (how much later it reads
+per time), "crosstalk" (how much of its neighbours each sensor reads), "curve" and "cubic" (one for all, the latter of
+u^3), "bond_2" (from the second site on), and "ramp of u[n]" (how fast that coefficient changes) and "step of u[n]" (by
+how much it does, at "when").
 """
 
 from __future__ import annotations
@@ -32,6 +34,8 @@ OWN_CURVE = "own-sensor-curve"
 HUM, PER_HALF = "sensor-hum", 1.25
 # A sensor that lags, one that is knocked, and all that see through a lens, likewise.
 LAG, JUMP, LENS = "sensor-lag", "sensor-jump", "sensor-saturation"
+# Sensors that hear their neighbours, one whose gain drifts, and one with a clock of its own, likewise.
+CROSSTALK, FADING, OWN_CLOCK = "sensor-crosstalk", "sensor-gain-drift", "sensor-clock"
 # Declared coefficients that change, likewise.
 AGEING, SLIP = "coefficient-drift", "coefficient-jump"
 # Springs of which no two are alike, likewise.
@@ -43,6 +47,10 @@ LOSS = "nonlinear-damping"
 CLASSIC = ("quadratic-coupling", LOSS)
 COUPLED = ("quadratic-coupling", "nonlinear-coupling", "asymmetric-coupling")
 MOST_EFFECTS = 5
+# What has a meaning where there are several sites that move.
+OF_SEVERAL = (
+    GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM, LAG, JUMP, MAINS, CROSSTALK, FADING, OWN_CLOCK
+)  # fmt: skip
 # What is asked for instead of names.
 ANY, NONE = "any", "none"
 DECLARED = {"onsite-linear": "u[n]", "onsite-cubic": "u[n]**3"}
@@ -52,7 +60,8 @@ NAMES = (
 )  # fmt: skip
 # How often each is drawn, where 1 is not given: what most recordings have.
 OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
-ASKED = (*NAMES, *LOCAL, BONDS, OWN_CURVE, HUM, LAG, JUMP, LENS, MAINS, AGEING, SLIP, *CLASSIC)
+ASKED = (*NAMES, *LOCAL, BONDS, OWN_CURVE, HUM, LAG, JUMP, LENS, MAINS, CROSSTALK, FADING, OWN_CLOCK,
+         AGEING, SLIP, *CLASSIC)  # fmt: skip
 """Every effect that can be asked for."""
 HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
 """Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
@@ -130,7 +139,9 @@ def sensible(chain: Chain, reach: int, names: Sequence[str] = NAMES) -> list[str
     for name in names:
         if DECLARED.get(name) in chain.declared:
             continue
-        if name in (GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM, LAG, JUMP, MAINS) and inner < 2:
+        if name in OF_SEVERAL and inner < 2:
+            continue
+        if name == CROSSTALK and reach:
             continue
         if name == BOND and not (chain.coupled and inner > 2):
             continue
@@ -197,6 +208,12 @@ def ingredient(name: str, chain: Chain, site: int, sign: float = 1.0) -> Ingredi
         return Ingredient(name, None, {"cubic": sign / chain.size**2}, 0.2, {})
     if name == LAG:
         return Ingredient(name, site, {f"lag_{site + 1}": 1 / chain.fast}, 0.3, {})
+    if name == CROSSTALK:
+        return Ingredient(name, None, {"crosstalk": sign}, 0.15, {})
+    if name == FADING:
+        return Ingredient(name, site, {f"fade_{site + 1}": sign}, 0.4, {})
+    if name == OWN_CLOCK:
+        return Ingredient(name, site, {f"slow_{site + 1}": 1 / chain.fast / chain.span}, 0.5, {})
     if name == GAIN:
         return Ingredient(name, site, {f"gain_{site + 1}": sign}, 0.4, {})
     if name == MASSES:

@@ -37,6 +37,8 @@ POWERS = {
     "nonlinear-coupling": -2, "quadratic-drag": -1, "nonlinear-damping": -2, "dry-friction": 1, "constant-force": 1,
     "drive": 1, "local-drive": 1, "sensor-curve": -2, "sensor-saturation": -3, "sensor-gain": -1,
 }  # fmt: skip
+# The label of what a single sensor has.
+SENSOR = r"(offset|gain|curve|lag|jump|drift of the gain|delay) of u(\d+)(?: and v\d+)?(?: per time)?"
 # The label of a wave, and minus the time since which its phase is counted.
 WAVE = r"(?:hum of u\d*, )?(cos|sin)\(.*\*(?:t|\(t([+-][^()]*)\))\)"
 # The label of a declared term whose coefficient changes steadily.
@@ -49,6 +51,9 @@ NAMED = {
     "curve of u": "curve",
     "cubic curve of u": "cubic",
     "scale": "scale",
+    "share of both neighbours in each reading": "crosstalk",
+    "drift of the gain": "fade",
+    "delay": "slow",
 }
 # Half the width of a 95 % interval, in standard errors.
 HALF = 1.959964
@@ -91,10 +96,9 @@ def called(values: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, 
     """
     found = {}
     for label, (value, error) in values.items():
-        sensor, wave = re.match(r"(offset|gain|curve|lag|jump) of u(\d+)(?: and v\d+)?$", label), re.match(WAVE, label)
-        ramp = re.fullmatch(RAMP, label)
+        sensor, wave, ramp = re.fullmatch(SENSOR, label), re.match(WAVE, label), re.fullmatch(RAMP, label)
         if sensor is not None:
-            found[f"{sensor[1]}_{sensor[2]}"] = (value + (sensor[1] == "gain"), error)
+            found[f"{NAMED.get(sensor[1], sensor[1])}_{sensor[2]}"] = (value + (sensor[1] == "gain"), error)
         elif ramp is not None:
             text = ramp[2].removeprefix("(").removesuffix(")") if ramp[2].startswith("(") else ramp[2]
             found[f"ramp of {text}"] = (value / float(ramp[1]), error / float(ramp[1]))

@@ -224,7 +224,11 @@ class Experiment:
 
         chain, sites = self.chain, self.chain.sites
         start = np.stack([np.concatenate([of[f"start.{level}.{k}"] for k in range(sites)], axis=1) for level in (0, 1)])
-        outer, sensors, beyond = self._outer, _Sensors(of, sites), _Beyond.of(of, self._outer, self._border)
+        outer, sensors, beyond = (
+            self._outer,
+            _Sensors(of, sites, float(self.times[-1])),
+            _Beyond.of(of, self._outer, self._border),
+        )
         known = ("start.", "border.")
         moving = {name: value for name, value in of.items() if not name.startswith(known) and np.any(value != 0)}
 
@@ -243,7 +247,7 @@ class Experiment:
         with np.errstate(all="ignore"):
             found = solve_ivp(
                 rate, (0.0, float(self.times[-1])), start.ravel(), t_eval=self.times, method="DOP853",
-                rtol=tolerance, atol=small, events=lost, dense_output=bool(np.any(sensors.lag)),
+                rtol=tolerance, atol=small, events=lost, dense_output=bool(np.any(sensors.lag) or np.any(sensors.slow)),
             )  # fmt: skip
             if found.status != 0 or not np.all(np.isfinite(found.y)):
                 return None
@@ -324,7 +328,7 @@ class _Beyond:
 class _Sensors:
     """What the sensors make of positions, per copy."""
 
-    def __init__(self, of: Mapping[str, ndarray], sites: int) -> None:
+    def __init__(self, of: Mapping[str, ndarray], sites: int, span: float) -> None:
         zero = np.zeros((len(next(iter(of.values()))), 1))
 
         def row(name: str) -> ndarray:
@@ -332,30 +336,34 @@ class _Sensors:
 
         self.offset, self.gain = row("offset"), 1 + row("gain")
         self.curve, self.lag = of.get("curve", zero) + row("curve"), row("lag")
-        self.cubic = of.get("cubic", zero)
+        self.cubic, self.crosstalk = of.get("cubic", zero), of.get("crosstalk", zero)
+        self.fade, self.slow, self.span = row("fade"), row("slow"), span
         jumping = [name.removeprefix("jump.jump@") for name in of if name.startswith("jump.jump")]
         self.jumps = {int(k): [of[f"jump.{name}@{k}"] for name in ("jump", "when")] for k in jumping}
         sites_that_hum = [name.removeprefix("hum.cos@") for name in of if name.startswith("hum.cos")]
         self.hums = {int(k): [of[f"hum.{name}@{k}"] for name in ("cos", "sin", "omega")] for k in sites_that_hum}
 
     def behind(self, times: ndarray, motion: Callable[[ndarray], ndarray]) -> Float[ndarray, "time copies sites"]:
-        """Return by how much positions were more a lag ago.
+        """Return by how much positions were more when they were read.
 
         Args:
             times: of the readings.
             motion: u and v at given times (2, copies, sites, T).
         """
         now, found = np.moveaxis(motion(times)[0], -1, 0), np.zeros((len(times), *self.lag.shape))
-        for site in np.flatnonzero(np.any(self.lag, axis=0)):
-            lag = float(self.lag[0, site])
-            u, v = np.moveaxis(motion(times - lag)[:, :, site], -1, 1)
-            # In a copy that differs by its lag, to first order in that.
-            found[..., site] = u - (self.lag[:, site] - lag) * v - now[..., site]
+        for site in np.flatnonzero(np.any(self.lag, axis=0) | np.any(self.slow, axis=0)):
+            late = self.lag[:, site] + times[:, None] * self.slow[:, site]
+            u, v = np.moveaxis(motion(times - late[:, 0])[:, :, site], -1, 1)
+            # In a copy that is late by another time, to first order in that.
+            found[..., site] = u - (late - late[:, :1]) * v - now[..., site]
         return found
 
     def read(self, t: float, u: Float[ndarray, "copies sites"]) -> ndarray:
         """Return the readings of positions as they were when they were read."""
-        found = np.asarray(self.gain * u + self.offset + self.curve * u**2 + self.cubic * u**3)
+        found = np.asarray((self.gain + self.fade * t / self.span) * u + self.offset + self.curve * u**2)
+        found += self.cubic * u**3
+        found[:, 1:] += self.crosstalk * u[:, :-1]
+        found[:, :-1] += self.crosstalk * u[:, 1:]
         for site, (cos, sin, omega) in self.hums.items():
             found[:, site] += (cos * np.cos(omega * t) + sin * np.sin(omega * t))[:, 0]
         for site, (jump, when) in self.jumps.items():
@@ -365,7 +373,7 @@ class _Sensors:
     def held(self, u: Float[ndarray, "copies sites"], outer: Sequence[int]) -> ndarray:
         """Return positions with the outer ones such that every copy has the readings of the first there.
 
-        Outer sensors neither hum, lag nor jump.
+        Outer sensors neither hum, lag, jump, fade nor hear others.
         """
         if not outer:
             return u

@@ -96,7 +96,7 @@ def test_what_a_recording_cannot_tell_from_an_effect_is_said_beside_it() -> None
     assert gain.alike == ("asymmetric-coupling",)
 
 
-def moved(one: LabRecording, more: Sequence[tuple[float, str]] = (), ago: float = 0.0) -> np.ndarray:
+def moved(one: LabRecording, more: Sequence[tuple[float, str]] = (), ago: float | np.ndarray = 0.0) -> np.ndarray:
     """Return positions at the first sixty times, or a while ago, by the declared terms and more: numbers and texts."""
     pieces = [*zip(one.coefficients.tolist(), one.declared.texts, strict=True), *more]
     term = Term(" + ".join(f"({size!r})*({text})" for size, text in pieces))
@@ -160,6 +160,22 @@ def test_a_sensor_that_lags_reads_where_the_site_was_a_moment_ago() -> None:
     expected = moved(one)
     expected[:, late.site] = moved(one, ago=lag)[:, late.site]
     np.testing.assert_allclose(expected, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
+
+
+def test_sensors_that_hear_their_neighbours_fade_or_are_slow_read_what_their_words_say() -> None:
+    for name in (effects.CROSSTALK, effects.FADING, effects.OWN_CLOCK):
+        one = make_recording(3, "white", [name], sites=3)
+        (wrong,) = one.effects
+        expected, (value,) = moved(one), wrong.parameters.values()
+        t, span = one.samples.t[:60], one.samples.t[-1]
+        if name == effects.CROSSTALK:
+            expected = expected + value * expected @ (np.eye(3, k=1) + np.eye(3, k=-1))
+        elif name == effects.FADING:
+            expected[:, wrong.site] *= 1 + value * t / span
+        else:
+            assert 0 < value * span * one.chain.fast <= 0.5
+            expected[:, wrong.site] = moved(one, ago=value * t)[:, wrong.site]
+        np.testing.assert_allclose(expected, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
 
 
 @pytest.mark.parametrize("names", [["local-drive", "local-damping", "bond-defect"]])
