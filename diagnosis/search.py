@@ -285,11 +285,11 @@ class Search:
 
     def _level(self, fits: list[Fitted], before: Fitted) -> list[Fitted]:
         """Return the best models of a horizon, where the declared equation alone leads to `before`."""
-        pool = Pool(self.problem, fits)
-        self.worth = pool.worth
-        opened: set[tuple[str, ...]] = set()
         # The declared equation is opened last, if it can be followed: one effect may do what several of a model do.
         last = [before] if before.longest == fits[0].longest else []
+        pool = Pool(self.problem, [*fits, *last])
+        self.worth = pool.worth
+        opened: set[tuple[str, ...]] = set()
         while todo := [one for one in (*pool.leading(), *last) if one.model.key not in opened]:
             opened.add(todo[0].model.key)
             leader = pool.leading()[0]
