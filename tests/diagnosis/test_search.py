@@ -74,6 +74,27 @@ def test_the_declared_equation_is_not_lost_beside_its_best_fit_a_wave_of_a_weak_
     assert found.models[0].model.names == ()
 
 
+def test_two_effects_that_undo_one_another_do_not_lead_the_declared_equation_alone():
+    """Springs at both outer sites of a chain with fixed ends make it a chain with free ones."""
+    t, modes = np.linspace(0, 60, 300), [(1, 1, 1), (1, 0, -1), (1, -2, 1)]
+    swings = zip((0.3, 0.2, 0.1), np.sqrt([1.0, 2.25, 4.75]), modes, strict=True)
+    u = sum(size * np.outer(np.cos(omega * t + k), mode) for k, (size, omega, mode) in enumerate(swings))
+    data = Samples(t, u + 0.01 * np.random.default_rng(3).normal(size=u.shape), source="chain", ends="free")
+    catalogue = [one for one in CATALOGUE if one.name in ("ends", "disorder")]
+    problem = Problem.of(library("chain", "u[n+1]+u[n-1]-2*u[n]; u[n]"), 2, [data], catalogue)
+    search = Search(problem, lambda _: None)
+    (found,) = search.horizons()
+    other = next(one for one in problem.candidates if one.other_ends() == "fixed")
+    springs = next(one for one in problem.candidates if one.effect.name == "disorder").moved([5 / 12, -10 / 12])
+    plain = found.before
+    # What a number of each site's own adds to is their mean.
+    bound = replace(plain.model, coefficients=(1.25, -2 / 12))
+    both = bound.with_effect(other).with_effect(springs)
+    undone = search.refit(both, plain.layout, plain.followed.nodes, plain, 25)
+    assert undone.cost < plain.cost + 1
+    assert search._level([undone], plain)[0].model.names == ()
+
+
 def test_readings_in_bursts_have_pieces_shorter_than_what_is_asked_for_and_an_end():
     """Bursts of twelve readings with gaps of thirty steps between them."""
     t = np.concatenate([0.2 * np.arange(12) + 8.2 * k for k in range(6)])
