@@ -128,9 +128,9 @@ class _Pull:
     def _added_in_time(self, force: Force) -> ndarray:
         """Return derivatives by the factor of what is added to readings of u at each time: (rows, 1 + D)."""
         weights = np.ones(self.chain.sites) if force.weights is None else force.weights
-        if force.text == "v[n]":
-            rate = self.tangent.along[self.number].field[:, 1] * weights
-            return np.asarray(np.einsum("rqn,rqnk->rk", rate, self.readings))
+        if force.text in ("u[n]", "v[n]"):
+            read = self.tangent.along[self.number].field[:, int(force.text == "v[n]")] * weights
+            return np.asarray(np.einsum("rqn,rqnk->rk", read, self.readings))
         return np.asarray(np.einsum("n,rnk->rk", weights, self.readings[:, int(force.text.startswith("i*"))]))
 
 

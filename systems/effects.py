@@ -45,6 +45,7 @@ HOW: dict[str, str] = {
     "with one for all in a recording",
     "curve": "the reading is u + c T(u), T being a power, with one c for all sensors or at one of them",
     "gain drift": "the reading is (1 + c (t - t_0) / T) u, T being the recording's length; at one site, which is found",
+    "gain jump": "the reading is (1 + c) u from one time on; at one site; time and site found",
     "crosstalk": "the reading is u + c times u of the sensors next to it, of the one on one side, or the mean of all",
     "imbalance": "the reading of a complex field is z + c conj(z), with one c for all sites",
     "lag": "the reading is u a time tau ago; at one site, which is found, with a tau for every site, or with one more "
@@ -336,6 +337,10 @@ CATALOGUE: tuple[Effect, ...] = (
         "sensor-gain-drift", "t*u[n]", acts="gain drift",
         look_for="a residual in proportion to one site's reading, more and more so",
         source=LJUNG,
+    ),
+    Effect(
+        "sensor-gain-jump", "u[n]", acts="gain jump",
+        look_for="a residual in proportion to one site's reading, from one time on", source=LJUNG,
     ),
     Effect(
         "sensor-imbalance", "", complex_field="conj(u[n])", acts="imbalance",

@@ -316,7 +316,7 @@ class Placed(ABC):
         return []
 
     def courses(self, chain: Chain) -> list[Force]:  # noqa: ARG002
-        """Return what it adds to readings of u in time: terms "1", "i*1" and "v[n]" with their factors."""
+        """Return what it adds to readings of u in time: terms "1", "i*1", "u[n]", "v[n]" with their factors."""
         return []
 
     def scaled(self) -> int | None:

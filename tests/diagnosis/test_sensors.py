@@ -26,7 +26,10 @@ from latticebench.systems.samples import Samples
 SITES, NOISE, T = 4, 3e-3, np.linspace(0, 20, 601)
 DECLARED, TRUTH = library("pendula", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])"), (2.0, -16.0)
 TURNING = library("turning", "i*(u[n+1]+u[n-1]-2*u[n]); i*abs(u[n])**2*u[n]")
-SOME = tuple(find(name) for name in ("damping", "sensor-gain", "sensor-lag", "sensor-crosstalk", "sensor-clock"))
+SOME = tuple(
+    find(name)
+    for name in ("damping", "sensor-gain", "sensor-lag", "sensor-gain-jump", "sensor-crosstalk", "sensor-clock")
+)
 
 
 def beside(u):
@@ -69,6 +72,11 @@ def faded():
     return readings(exact()(T) * (1 - np.outer(T / T[-1], [0.0, 0.125, 0.0, 0.0])))
 
 
+def switched():
+    """What is read where the gain of the third sensor rises by a twentieth between two readings."""
+    return readings(exact()(T) * (1 + np.outer(T > 9.01, [0.0, 0.0, 0.05, 0.0])))
+
+
 def slow_clock(*sites):
     """What is read where the clock of some sensors is slow by a thousandth."""
     late = exact()(T - 1e-3 * T)
@@ -100,6 +108,7 @@ RECORDED = {
     "crosstalk of the one after": (lambda: mixed(0.03, 1), "sensor-crosstalk", 0.03),
     "a common ground": (lambda: grounded(0.3), "sensor-crosstalk", -0.3),
     "a gain that falls": (faded, "sensor-gain-drift", -0.125),
+    "a gain that is switched": (switched, "sensor-gain-jump", 0.05),
     "a slow clock": (lambda: slow_clock(2), "sensor-clock", 1e-3),
     "a slow clock of two": (lambda: slow_clock(2, 3), "sensor-clock", 1e-3),
 }
@@ -114,7 +123,7 @@ def judge(found: Diagnosis, name: str, value: float) -> None:
     assert placed.sentences(found.after.chain)
 
 
-@pytest.mark.parametrize("what", ["crosstalk of neighbours", "a slow clock"])
+@pytest.mark.parametrize("what", ["crosstalk of neighbours", "a gain that is switched", "a slow clock"])
 def test_what_a_sensor_does_to_its_readings_is_told_from_what_else_it_could_be(what):
     made, name, value = RECORDED[what]
     judge(diagnose(DECLARED, 2, [made()], SOME), name, value)

@@ -98,6 +98,7 @@ MISREADINGS = {
     "sensor-hum": _misread(instrument.humming),
     "sensor-lag": replace(_misread(instrument.slow), only="second order"),
     "sensor-gain-drift": _misread(instrument.fading),
+    "sensor-gain-jump": _misread(instrument.switched),
     "sensor-crosstalk": _misread(instrument.crosstalk),
     "sensor-imbalance": replace(_misread(instrument.unbalanced), only="complex"),
     "sensor-clock": replace(_misread(instrument.own_clock), only="second order"),

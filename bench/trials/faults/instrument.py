@@ -37,6 +37,12 @@ def fading(setting: Setting, size: float) -> Fields:
     return _with_scale(setting.run(), 1 + size * along[:, None] * setting.one)
 
 
+def switched(setting: Setting, size: float) -> Fields:
+    """Change the gain of one sensor at one time."""
+    after = (setting.times > setting.drawn.about["at"])[:, None]
+    return _with_scale(setting.run(), 1 + size * after * setting.one)
+
+
 def curve(setting: Setting, size: float) -> Fields:
     """Bend the scale: u + size u^2, of a complex field u + size |u| u."""
     u, v = setting.run()
