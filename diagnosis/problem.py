@@ -154,6 +154,7 @@ class Problem:
             tuple(map(_read, data)) if len(parts) == len(free) and 1 < len(free) <= SEVERAL else (),
             step,
             float(spectrum.peaks[0]) if len(spectrum.peaks) else 0.0,
+            max(float(np.nanmax(np.abs(one.u))) for one in data),
         )
         candidates = tuple(one for effect in catalogue for one in way_of(effect).places(effect, scene))
         return cls(

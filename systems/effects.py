@@ -44,6 +44,7 @@ HOW: dict[str, str] = {
     "gain": "the reading is g u; at one site, which is found, with a g for every site, or "
     "with one for all in a recording",
     "curve": "the reading is u + c T(u), T being a power, with one c for all sensors or at one of them",
+    "cyclic": "the reading is u + a sin(k u) + b (cos(k u) - 1), at one sensor or with the same for all; k found",
     "gain drift": "the reading is (1 + c (t - t_0) / T) u, T being the recording's length; at one site, which is found",
     "gain jump": "the reading is (1 + c) u from one time on; at one site; time and site found",
     "crosstalk": "the reading is u + c times u of the sensors next to it, of the one on one side, or the mean of all",
@@ -333,6 +334,11 @@ CATALOGUE: tuple[Effect, ...] = (
         source="Kay, Fundamentals of Statistical Signal Processing: Estimation Theory (1993), example 4.2",
     ),
     Effect("sensor-gain", "u[n]", acts="gain", look_for="a residual in proportion to one site's reading", source=LJUNG),
+    Effect(
+        "sensor-cyclic", "sin(u[n])", complex_field="", acts="cyclic",
+        look_for="an error that repeats with the reading, once in a turn of an encoder or a fringe",
+        source="Heydemann, Appl. Opt. 20, 3382 (1981)",
+    ),
     Effect(
         "sensor-gain-drift", "t*u[n]", acts="gain drift",
         look_for="a residual in proportion to one site's reading, more and more so",

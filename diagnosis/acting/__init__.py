@@ -6,16 +6,15 @@ import pkgutil
 from latticebench.diagnosis.acting.placed import (
     WAYS,
     AtOneSite,
-    Chain,
     Force,
     InStep,
     Misreading,
     OfSensors,
     Placed,
-    Scene,
     Summand,
     way_of,
 )
+from latticebench.diagnosis.acting.scene import Chain, Scene
 
 # Every file of this folder makes its way of acting known.
 for _module in pkgutil.iter_modules(__path__):

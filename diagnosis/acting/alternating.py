@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.acting.everywhere import Everywhere
-from latticebench.diagnosis.acting.placed import Chain, Placed, Scene, Summand
+from latticebench.diagnosis.acting.placed import Placed, Summand
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
 

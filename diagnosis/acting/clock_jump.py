@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from latticebench.diagnosis.acting.late import Late
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Placed, Scene
+from latticebench.diagnosis.acting.placed import DIGITS, Force, Placed
 from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.diagnosis.acting.sudden import Rise, Sudden
 from latticebench.systems.effects import Effect
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, OfSensors, Placed, Scene
+from latticebench.diagnosis.acting.placed import DIGITS, Misreading, OfSensors, Placed
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 from latticebench.systems.errors import InputError
 from latticebench.systems.terms import Term

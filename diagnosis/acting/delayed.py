@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Placed, Scene, Summand
+from latticebench.diagnosis.acting.placed import DIGITS, Force, Placed, Summand
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.methods.engine.dynamics import Factor
 from latticebench.systems.effects import Effect
 

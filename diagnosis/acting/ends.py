@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-from latticebench.diagnosis.acting.placed import Chain, Placed, Scene
+from latticebench.diagnosis.acting.placed import Placed
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 from latticebench.systems.stencil import Ends
 

@@ -9,7 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from latticebench.diagnosis.acting.one_site import alike
-from latticebench.diagnosis.acting.placed import Chain, Force, Placed, Scene
+from latticebench.diagnosis.acting.placed import Force, Placed
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 from latticebench.systems.stencil import evaluate
 from latticebench.systems.terms import Term

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from latticebench.diagnosis.acting.harmonic import Harmonic
-from latticebench.diagnosis.acting.placed import AtOneSite, Placed, Scene
+from latticebench.diagnosis.acting.placed import AtOneSite, Placed
+from latticebench.diagnosis.acting.scene import Scene
 from latticebench.systems.effects import Effect
 
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from latticebench.diagnosis.acting.harmonic import Swinging
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Misreading, OfSensors, Placed, Scene
+from latticebench.diagnosis.acting.placed import DIGITS, Force, Misreading, OfSensors, Placed
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Misreading, Placed, Scene
+from latticebench.diagnosis.acting.placed import DIGITS, Misreading, Placed
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:

@@ -8,16 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import (
-    DIGITS,
-    Chain,
-    Force,
-    Misreading,
-    OfSensors,
-    Placed,
-    Scene,
-)
+from latticebench.diagnosis.acting.placed import DIGITS, Force, Misreading, OfSensors, Placed
 from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.diagnosis.acting.sudden import Rise, Sudden
 from latticebench.systems.effects import Effect
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Force, Placed, Scene, joined, times
+from latticebench.diagnosis.acting.placed import AtOneSite, Force, Placed, joined, times
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 
 

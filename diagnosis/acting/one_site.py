@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from latticebench.diagnosis.acting.placed import AtOneSite, Chain, Force, Placed, Scene
+from latticebench.diagnosis.acting.placed import AtOneSite, Force, Placed
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
 

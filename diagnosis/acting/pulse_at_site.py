@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from latticebench.diagnosis.acting.placed import AtOneSite, Placed, Scene
+from latticebench.diagnosis.acting.placed import AtOneSite, Placed
 from latticebench.diagnosis.acting.pulse import Pulse, bells
+from latticebench.diagnosis.acting.scene import Scene
 from latticebench.systems.effects import Effect
 
 

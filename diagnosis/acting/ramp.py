@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import Chain, Force, InStep, Placed, Scene, Summand, decimal, since
+from latticebench.diagnosis.acting.placed import Force, InStep, Placed, Summand, decimal, since
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
 

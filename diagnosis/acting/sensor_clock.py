@@ -10,13 +10,14 @@ import numpy as np
 
 from latticebench.diagnosis.acting.lag import MOST_TURNED
 from latticebench.diagnosis.acting.late import Late
-from latticebench.diagnosis.acting.placed import OfSensors, Placed, Scene
+from latticebench.diagnosis.acting.placed import OfSensors, Placed
+from latticebench.diagnosis.acting.scene import Scene
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
     from numpy import ndarray
 
-    from latticebench.diagnosis.acting.placed import Chain
+    from latticebench.diagnosis.acting.scene import Chain
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

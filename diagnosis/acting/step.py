@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Chain, Force, Placed, Scene
+from latticebench.diagnosis.acting.placed import DIGITS, Force, Placed
 from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
 from latticebench.diagnosis.acting.ramp import changing
+from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.diagnosis.acting.sudden import Rise, Sudden
 from latticebench.systems.effects import Effect
 

@@ -17,9 +17,8 @@ if TYPE_CHECKING:
 
     from latticebench.diagnosis.problem import Problem
 
-# Fringes of a cyclic error over the largest reading; shares of it beyond which readings are clipped; numbers of courses
-# in time.
-FRINGES, CLIPPED, COURSES = (1, 2, 4, 8, 16), (0.5, 0.7, 0.85), (8, 32, 64)
+# Shares of the largest reading beyond which readings are clipped; numbers of courses in time.
+CLIPPED, COURSES = (0.5, 0.7, 0.85), (8, 32, 64)
 
 Reading = Callable[["ndarray", "ndarray"], tuple["ndarray", "ndarray | float"]]
 """From times (rows,) and a motion (rows, order, parts, N) to what is added to the reading per unit of a strength, and
@@ -61,10 +60,7 @@ def readings(problem: Problem) -> Iterator[Misread]:
     if chain.levels > 1:
         yield _misread("readings that lag", [_rate])
     yield from _between(problem)
-    largest = max(float(np.nanmax(np.abs(one.u))) for one in problem.data)
-    for count in FRINGES:
-        yield _misread(f"an error of {count} fringes", [_fringe(np.pi * count / largest, phase) for phase in (0, 1)])
-    yield _misread("readings clipped above", [_beyond(share * largest) for share in CLIPPED])
+    yield _misread("readings clipped above", [_beyond(share * problem.scene.largest) for share in CLIPPED])
     rows = max(len(one.t) for one in problem.data)
     for number in sorted({min(one, rows // 2) for one in COURSES}):
         if number >= COURSES[0]:
@@ -119,14 +115,6 @@ def _scaled(factor: ndarray) -> Reading:
 
 def _rate(t: ndarray, field: ndarray) -> tuple[ndarray, float]:  # noqa: ARG001
     return -field[:, 1:2], 0.0
-
-
-def _fringe(angle: float, phase: int) -> Reading:
-    def added(_: ndarray, field: ndarray) -> tuple[ndarray, ndarray]:
-        turned = angle * field + phase * np.pi / 2
-        return np.sin(turned), angle * np.cos(turned)
-
-    return added
 
 
 def _beyond(level: float) -> Reading:

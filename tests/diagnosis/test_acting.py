@@ -28,7 +28,7 @@ COUPLING = "u[n+1]+u[n-1]-2*u[n]"
 REAL = (library("duffing", f"{COUPLING}; u[n]; u[n]**3"), (0.9, -1.0, -0.3))
 COMPLEX = (library("turning", f"i*({COUPLING}); i*abs(u[n])**2*u[n]"), (0.8, 0.6))
 EVERY_WAY = [(way, False) for way in WAYS if way != "imbalance"]
-EVERY_WAY += [(way, True) for way in WAYS if way not in ("clock", "clock jump", "lag", "sensor clock")]
+EVERY_WAY += [(way, True) for way in WAYS if way not in ("clock", "clock jump", "lag", "sensor clock", "cyclic")]
 # These have no numbers: the noise says how far a zero wanders.
 NUMBERED = [pair for pair in EVERY_WAY if pair[0] not in ("ends", "wander")]
 

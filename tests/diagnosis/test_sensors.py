@@ -28,7 +28,15 @@ DECLARED, TRUTH = library("pendula", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])"), (2.0, -
 TURNING = library("turning", "i*(u[n+1]+u[n-1]-2*u[n]); i*abs(u[n])**2*u[n]")
 SOME = tuple(
     find(name)
-    for name in ("damping", "sensor-gain", "sensor-lag", "sensor-gain-jump", "sensor-crosstalk", "sensor-clock")
+    for name in (
+        "damping",
+        "sensor-gain",
+        "sensor-lag",
+        "sensor-cyclic",
+        "sensor-gain-jump",
+        "sensor-crosstalk",
+        "sensor-clock",
+    )
 )
 
 
@@ -77,6 +85,13 @@ def switched():
     return readings(exact()(T) * (1 + np.outer(T > 9.01, [0.0, 0.0, 0.05, 0.0])))
 
 
+def out_of_centre():
+    """What is read where the encoder of the first site turns about another centre than its axis: once in a radian."""
+    u = exact()(T)
+    error = 0.02 * np.sin(2 * np.pi * u) + 0.01 * (np.cos(2 * np.pi * u) - 1)
+    return readings(u + error * np.array([1.0, 0.0, 0.0, 0.0]))
+
+
 def slow_clock(*sites):
     """What is read where the clock of some sensors is slow by a thousandth."""
     late = exact()(T - 1e-3 * T)
@@ -108,6 +123,7 @@ RECORDED = {
     "crosstalk of the one after": (lambda: mixed(0.03, 1), "sensor-crosstalk", 0.03),
     "a common ground": (lambda: grounded(0.3), "sensor-crosstalk", -0.3),
     "a gain that falls": (faded, "sensor-gain-drift", -0.125),
+    "an encoder out of centre": (out_of_centre, "sensor-cyclic", 0.02),
     "a gain that is switched": (switched, "sensor-gain-jump", 0.05),
     "a slow clock": (lambda: slow_clock(2), "sensor-clock", 1e-3),
     "a slow clock of two": (lambda: slow_clock(2, 3), "sensor-clock", 1e-3),
@@ -123,7 +139,9 @@ def judge(found: Diagnosis, name: str, value: float) -> None:
     assert placed.sentences(found.after.chain)
 
 
-@pytest.mark.parametrize("what", ["crosstalk of neighbours", "a gain that is switched", "a slow clock"])
+@pytest.mark.parametrize(
+    "what", ["crosstalk of neighbours", "an encoder out of centre", "a gain that is switched", "a slow clock"]
+)
 def test_what_a_sensor_does_to_its_readings_is_told_from_what_else_it_could_be(what):
     made, name, value = RECORDED[what]
     judge(diagnose(DECLARED, 2, [made()], SOME), name, value)

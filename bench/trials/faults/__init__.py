@@ -29,13 +29,13 @@ class Fault:
 
     Attributes:
         fields: from a setting and an amount to the clean readings.
-        only: where it makes sense: on lattices of second order, for complex fields, or everywhere (None).
+        only: where it makes sense: on lattices of second order, for complex or for real fields, or everywhere (None).
         real: whether its amount is a real number for complex fields, too.
         sized: whether there can be more or less of it.
     """
 
     fields: Callable[[Setting, complex], Fields]
-    only: Literal["second order", "complex"] | None = None
+    only: Literal["second order", "complex", "real"] | None = None
     real: bool = False
     sized: bool = True
 
@@ -43,7 +43,9 @@ class Fault:
         """Return whether a system can have it."""
         if self.only is None:
             return True
-        return system.is_complex if self.only == "complex" else system.order == 2
+        if self.only == "second order":
+            return system.order == 2
+        return system.is_complex == (self.only == "complex")
 
 
 def _pushed(name: str, only: Literal["second order", "complex"] | None = None, *, real: bool = False) -> Fault:
@@ -97,6 +99,7 @@ MISREADINGS = {
     "sensor-wander": _misread(instrument.wander),
     "sensor-hum": _misread(instrument.humming),
     "sensor-lag": replace(_misread(instrument.slow), only="second order"),
+    "sensor-cyclic": replace(_misread(instrument.cyclic), only="real"),
     "sensor-gain-drift": _misread(instrument.fading),
     "sensor-gain-jump": _misread(instrument.switched),
     "sensor-crosstalk": _misread(instrument.crosstalk),
