@@ -12,12 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.reading import read_by
+from latticebench.diagnosis.acting.late import MOST_TURNED, Late
+from latticebench.diagnosis.reading import Sensitivity, read_by
 from latticebench.methods.engine.dynamics import split_parts
 from latticebench.systems.stencil import numbers
 from latticebench.systems.terms import combination
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jaxtyping import Float
     from numpy import ndarray
 
@@ -26,9 +29,8 @@ if TYPE_CHECKING:
     from latticebench.systems.samples import Samples
     from latticebench.systems.stencil import Ends
 
-# Steps to the field whose reading is known. Instruments are nearly linear; where sensors hear others, what is left of
-# them falls at least by half with each.
-STEPS = 50
+# Newton's steps to the field whose reading is known; instruments are nearly linear.
+STEPS = 20
 # A text that needs no brackets in a product.
 SIMPLE = re.compile(r"|[uvf]\[n(?:[+-]\d+)?\](?:\*\*\d+)?")
 # Digits of a weight or a number of time within a term.
@@ -109,8 +111,8 @@ def _when(factor: object) -> str:
 def corrected(model: Model, samples: Samples, recording: int) -> Samples:
     """Return a recording as instruments without the model's faults would have read it; what is missing stays so.
 
-    A zero that wanders is no number, and stays; so does a lag where no velocities were read, or of more than a sixth of
-    a period. Where a clock jumps, times are corrected.
+    What `staying` returns stays. Where a clock jumps, times are corrected. What a sensor hears of one that was not read
+    for a while is taken from straight lines.
 
     Args:
         model: whose instruments are undone.
@@ -119,16 +121,45 @@ def corrected(model: Model, samples: Samples, recording: int) -> Samples:
     """
     both = samples.v is not None and model.order == 2
     every = [placed for placed, _ in model.instruments(recording) if placed.quickened() is None]
+    remains = staying(every, velocities=both)
     lost = sum((placed.told(samples.t) - samples.t for placed in every), np.zeros(len(samples.t)))
     t = samples.t + lost if np.all(np.diff(samples.t + lost) > 0) else samples.t
-    faults = [one for one in every if not one.stays(velocities=both) and np.array_equal(one.told(samples.t), samples.t)]
+    faults = [one for one in every if one not in remains and np.array_equal(one.told(samples.t), samples.t)]
     if not faults:
         return replace(samples, t=t)
     fields = [samples.u, samples.v] if both and samples.v is not None else [samples.u]
     read = np.stack([split_parts(one, samples.is_complex) for one in fields], axis=1)
-    field = read.copy()
+    known = np.isfinite(read)
+    whole = _bridged(samples.t, read)
+    field = whole.copy()
     for _ in range(STEPS):
         wrong = read_by(faults, samples.t, field)
-        field -= (field + wrong.added - read) / (1 + wrong.slope)
+        field -= Sensitivity.of(wrong).undone(field + wrong.added - whole)
+    field = np.where(known, field, np.nan)
     parts = field[:, :, 0] + (1j * field[:, :, 1] if samples.is_complex else 0.0)
     return replace(samples, t=t, u=parts[:, 0], v=parts[:, 1] if both else samples.v)
+
+
+def staying(instruments: Sequence[Placed], *, velocities: bool) -> list[Placed]:
+    """Return those of the instruments whose faults corrected readings still have.
+
+    These are zeros that wander, which are no numbers; what makes readings late where no velocities were read; and all
+    of it where together it turns a swing by more than a sixth of a period.
+
+    Args:
+        instruments: of a model.
+        velocities: whether those were read.
+    """
+    late = [one for one in instruments if isinstance(one, Late)]
+    far = sum(one.omega * one.latest for one in late) > MOST_TURNED
+    return [one for one in instruments if one.stays(velocities=velocities) or (far and one in late and one.latest > 0)]
+
+
+def _bridged(t: ndarray, read: Float[ndarray, "time levels parts sites"]) -> ndarray:
+    """Return readings with straight lines where none were taken, and nothing where there are none at all."""
+    found = read.copy()
+    for channel in np.moveaxis(found.reshape(len(t), -1), 1, 0):
+        known = np.isfinite(channel)
+        if not np.all(known):
+            channel[~known] = np.interp(t[~known], t[known], channel[known]) if np.any(known) else 0.0
+    return found

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
+# The least slope of a reading that can be undone, and numbers that are worked on at a time.
+LEAST_SLOPE, CHUNK = 0.05, 2_000_000
+
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
@@ -51,6 +54,18 @@ class Sensitivity:
         """Return that of some rows."""
         return Sensitivity(self.own[rows], None if self.by_rates is None else self.by_rates[rows], self.by_others)
 
+    def undone(self, difference: Float[ndarray, "rows levels parts sites"]) -> ndarray:
+        """Return by how much the fields differ where the readings do so, to first order, whatever v and its rate do."""
+        own = np.where(np.abs(self.own) > LEAST_SLOPE, self.own, 1.0)
+        if self.by_others is None:
+            return difference / own
+        rows, levels = own.shape[:2]
+        flat, found = own.reshape(rows, levels, -1), np.zeros((rows, levels, own[0, 0].size))
+        for some in np.array_split(np.arange(rows), rows * self.by_others.size // CHUNK + 1):
+            matrix = self.by_others + flat[some][..., None] * np.eye(flat.shape[2])
+            found[some] = np.linalg.solve(matrix, difference[some].reshape(len(some), levels, -1, 1))[..., 0]
+        return found.reshape(difference.shape)
+
     def forward(
         self, by: Float[ndarray, "rows levels parts sites count"], by_field: ndarray
     ) -> Float[ndarray, "rows channels count"]:
@@ -83,7 +98,7 @@ def read_by(instruments: Sequence[Placed], t: ndarray, field: Float[ndarray, "ro
     """Return what instruments make of a motion; numbers are those of the instruments one after another.
 
     First readings are late by all that makes them so; all the rest is done to what is read then, and adds up.
-    Derivatives by other sites are those of readings that are on time.
+    Derivatives by the motion of other sites are those of readings that are on time.
 
     Args:
         instruments: in the order of their numbers.
@@ -97,12 +112,15 @@ def read_by(instruments: Sequence[Placed], t: ndarray, field: Float[ndarray, "ro
     added, slope = np.zeros_like(field), np.zeros_like(field)
     for wrong in rest:
         added, slope = added + wrong.added, slope + wrong.slope
-    mixed = [wrong.by_others for wrong in rest if wrong.by_others is not None]
-    by_others = np.sum(mixed, axis=0) if mixed else None
+    mixing = [wrong.by_others for wrong in rest if wrong.by_others is not None]
+    by_others = np.sum(mixing, axis=0) if mixing else None
     by, others, begin = [], iter(rest), 0
     for one in instruments:
         if isinstance(one, Late) and first is not None:
-            by.append((1 + slope) * first.by[begin : begin + one.count])
+            own = first.by[begin : begin + one.count]
+            by.append((1 + slope) * own)
+            if by_others is not None:
+                by[-1] += np.moveaxis(_mixed(by_others, np.moveaxis(own, 0, -1)), -1, 0)
             begin += one.count
         else:
             by.append(next(others).by)

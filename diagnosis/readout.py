@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.reading import read_by
+from latticebench.diagnosis.reading import Sensitivity, read_by
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from latticebench.diagnosis.horizon import Layout
 
-# Newton steps that undo what instruments do, and the least slope of a reading that can be undone.
-UNREAD, LEAST_SLOPE = 6, 0.05
+# Newton steps that undo what instruments do.
+UNREAD = 6
 
 
 def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "time state"]) -> ndarray:
@@ -37,9 +37,8 @@ def unread(model: Model, layout: Layout, number: int, nodes: Float[ndarray, "tim
     field = reading.copy()
     for _ in range(UNREAD):
         wrong = read_by(instruments, t, field).read(chain.levels)
-        level, own = field[:, : chain.levels] + wrong.added, 1 + wrong.slope
-        own = np.where(np.abs(own) > LEAST_SLOPE, own, 1.0)
-        field[:, : chain.levels] += (reading[:, : chain.levels] - level) / own
+        level, sensitivity = field[:, : chain.levels] + wrong.added, Sensitivity.of(wrong)
+        field[:, : chain.levels] += sensitivity.undone(reading[:, : chain.levels] - level)
     if chain.levels < field.shape[1]:
-        field[:, 1] = reading[:, 1] / own[:, 0]
+        field[:, 1] = sensitivity.undone(reading[:, 1:2])[:, 0]
     return np.asarray(field[..., layout.plain.moving].reshape(nodes.shape))

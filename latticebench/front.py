@@ -25,7 +25,7 @@ import pandas as pd
 from latticebench.bench import calls
 from latticebench.bench.overlay import of_diagnosis
 from latticebench.bench.report.rows import html_table
-from latticebench.diagnosis.cure import Cure, corrected, cure
+from latticebench.diagnosis.cure import Cure, corrected, cure, staying
 from latticebench.diagnosis.instrument import without
 from latticebench.exhibit import Exhibit
 from latticebench.pictures import FROM_PYTHON
@@ -113,19 +113,19 @@ class Cause(Exhibit):
     def left_out(self) -> tuple[str, ...]:
         """The effects that neither `model` nor `corrected` has: memory, a clock, a zero that wanders.
 
-        Without velocities a lag is one of them; so is one of more than a sixth of a period.
+        Without velocities what makes readings late is one of them; so is what does so by more than a sixth of a period.
         """
         unread = any(one.v is None for one in self.recording.samples)
         placed = [one.placed for one in self.result.findings]
-        staying = [one.effect.name for one in placed if one.stays(velocities=not unread)]
-        return (*self._cure.left_out, *staying)
+        instruments = [one for one in placed if one.instrument]
+        return (*self._cure.left_out, *(one.effect.name for one in staying(instruments, velocities=not unread)))
 
     @functools.cached_property
     def corrected(self) -> Recording:
-        """The recording as it would read without the offsets, drifts, factors and bends that were found, and lags.
+        """The recording as it would read without what was found of its sensors: offsets, factors, crosstalk, lags.
 
-        Lags stay where no velocities were read, see `left_out`. Where a clock jumps, times are others than in the file.
-        A sensor that always reads the same has no readings in it.
+        What makes readings late stays where no velocities were read, see `left_out`. Where a clock jumps, times are
+        others than in the file. A sensor that always reads the same has no readings in it.
         """
         model, dead = self.result.after.model, self.result.dead
         return Recording(tuple(corrected(model, without(one, dead), k) for k, one in enumerate(self.recording.samples)))

@@ -89,7 +89,7 @@ def of_natural(name: str, units: Units, order: int = 2) -> tuple[float, str]:
     if re.match(r"(walk|hum) of \w+$", name):
         # A standard deviation has no sign, nor has how far a hum goes to either side.
         return 1 / abs(units.scale), units.reading
-    if name.startswith(("offset of ", "drift of ", "hum of ", "jump of ")):
+    if name.startswith(("offset of ", "drift of ", "hum of ", "jump of ", "sin of ", "cos of ", "cycle of ")):
         return 1 / units.scale, units.reading
     if name == "omega":
         return 1.0, rate_of("rad", units.time)

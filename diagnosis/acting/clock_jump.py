@@ -89,6 +89,15 @@ class ClockJump(Sudden, Late, acts="clock jump"):
             found.append(Force("v[n]", 0.0, {2: lost * self.width / wide**2}, None, Rise(self.at, wide, 1)))
         return found
 
+    @property
+    def latest(self) -> float:
+        """Nothing: times are put right."""
+        return 0.0
+
+    def stays(self, *, velocities: bool) -> bool:  # noqa: ARG002
+        """Return that times are put right, whatever was read."""
+        return False
+
     def lateness(self, t: ndarray, sites: int) -> tuple[ndarray, ndarray]:  # noqa: ARG002
         """Return how late readings are, which is less than not at all, and its derivatives by the numbers."""
         (lost,), wide = self.strength, self.wide

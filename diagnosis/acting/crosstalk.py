@@ -61,7 +61,7 @@ class Crosstalk(Placed, acts="crosstalk"):
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return what is heard."""
-        return (f"share of {self._which} in each reading",)
+        return (f"share of {self._which} in each reading" + (", velocities too" if self.both else ""),)
 
     @property
     def _which(self) -> str:

@@ -79,6 +79,12 @@ class Cyclic(OfSensors, acts="cyclic"):
         slope[:, 0][..., list(self.sites)] = self.per_reading * (a * cos - b * sin)
         return Misreading(np.tensordot(self.strength, by[:2], 1), slope, by)
 
+    def natural(self, chain: Chain, frequency: float) -> dict[str, float]:  # noqa: ARG002
+        """Return the waves, and after which difference the error repeats."""
+        labels = self.labels(chain)
+        cycle = 2 * np.pi / abs(self.per_reading)
+        return dict(zip((*labels, f"cycle{labels[0].removeprefix('sin')}"), (*self.strength, cycle), strict=True))
+
     def sentences(self, chain: Chain) -> list[str]:
         """Return how large the error is, and after which difference it repeats."""
         which = "all sensors" if len(self.sites) == chain.sites else f"the sensor of u{self.sites[0] + 1}"

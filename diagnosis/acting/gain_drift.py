@@ -50,7 +50,12 @@ class GainDrift(OfSensors, acts="gain drift"):
         """Return the columns whose gain drifts."""
         site = self.sites[0] + 1
         column = f"re{site} and im{site}" if chain.is_complex else f"u{site}" + (f" and v{site}" if self.both else "")
-        return (f"drift of the gain of {column}",)
+        return (f"growth of the gain of {column}",)
+
+    @property
+    def possible(self) -> bool:
+        """Whether the gain keeps its sign."""
+        return self.strength[0] > -1
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:
         """Return what the gain adds."""

@@ -54,7 +54,12 @@ class GainJump(Sudden, OfSensors, acts="gain jump"):
         """Return the columns whose gain changes."""
         site = self.sites[0] + 1
         column = f"re{site} and im{site}" if chain.is_complex else f"u{site}" + (f" and v{site}" if self.both else "")
-        return (f"jump of the gain of {column}",)
+        return (f"change of the gain of {column}",)
+
+    @property
+    def possible(self) -> bool:
+        """Whether it happens between the first and the last time, and the gain keeps its sign."""
+        return super().possible and self.strength[0] > -1
 
     def share(self, chain: Chain) -> Float[ndarray, " sites"]:
         """Return 1 at the sensor, 0 elsewhere."""

@@ -16,9 +16,6 @@ from latticebench.systems.effects import Effect
 if TYPE_CHECKING:
     from numpy import ndarray
 
-# The angle of the main frequency up to which a lag is undone by velocities.
-MOST_TURNED = 1.0
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Lag(OfSensors, Late, acts="lag"):
@@ -60,10 +57,11 @@ class Lag(OfSensors, Late, acts="lag"):
         """Whether no single sensor is ahead of all others: these then lag."""
         return self.site is None or self.strength[0] >= 0
 
-    def stays(self, *, velocities: bool) -> bool:
-        """Return whether there are no velocities to undo it with, or it turns a swing too far for that."""
+    @property
+    def latest(self) -> float:
+        """The longest lag."""
         lags = np.arange(len(self.sites)) * self.strength[0] if self.in_turn else np.array(self.strength)
-        return not velocities or bool(np.max(np.abs(self.omega * lags)) > MOST_TURNED)
+        return float(np.max(np.abs(lags)))
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return the columns that lag."""

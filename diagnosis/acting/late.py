@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
+# The angle of the main frequency up to which a lag is undone by velocities.
+MOST_TURNED = 1.0
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Late(Placed):
@@ -28,6 +31,15 @@ class Late(Placed):
     omega: float = 0.0
     instrument: ClassVar[bool] = True
     velocities: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def latest(self) -> float:
+        """By how much a reading is late at most that corrected times do not put right."""
+
+    def stays(self, *, velocities: bool) -> bool:
+        """Return whether there are no velocities to undo it with, or it turns a swing too far for that."""
+        return not velocities or self.omega * self.latest > MOST_TURNED
 
     @abstractmethod
     def lateness(self, t: Float[ndarray, " rows"], sites: int) -> tuple[ndarray, ndarray]:

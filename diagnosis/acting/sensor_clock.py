@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.acting.lag import MOST_TURNED
 from latticebench.diagnosis.acting.late import Late
 from latticebench.diagnosis.acting.placed import OfSensors, Placed
 from latticebench.diagnosis.acting.scene import Scene
@@ -27,26 +26,33 @@ class SensorClock(OfSensors, Late, acts="sensor clock"):
     Loggers that were started together have clocks of their own. Where they were not, there is a lag, too.
 
     Attributes:
-        begin, span: t_0, and the length of the longest recording.
+        begin: t_0, when the longest recording begins.
+        seen: the first and the last time of all recordings.
     """
 
     begin: float
-    span: float
+    seen: tuple[float, float]
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
-        """Return each sensor of several, and all from one on; sites without an equation are taken to be on time."""
+        """Return each sensor of several, and all from one on; sites without an equation are taken to be on time.
+
+        Where no velocities tell of the unit of time, one sensor that is slow is all others that are fast: of both, one
+        is returned.
+        """
         chain = scene.chain
         if chain.sites < 2 or not effect.texts(chain.order, chain.is_complex):
             return
+        free = len(chain.moving) == chain.sites and chain.levels == 1
         single = [(site,) for site in chain.moving]
-        later = [chain.moving[k:] for k in range(1, len(chain.moving) - 1)]
-        for sites in (*single, *later):
-            yield cls(effect=effect, sites=sites, begin=scene.begin, span=scene.span, omega=scene.main, strength=(0.0,))
+        later = [chain.moving[k:] for k in range(1 + free, len(chain.moving) - 1)]
+        for sites in (*(single[1:] if free and len(single) == 2 else single), *later):
+            yield cls(effect=effect, sites=sites, begin=scene.begin, seen=scene.seen, omega=scene.main, strength=(0.0,))
 
-    def stays(self, *, velocities: bool) -> bool:
-        """Return whether there are no velocities to undo it with, or it turns a swing too far for that."""
-        return not velocities or abs(self.omega * self.strength[0]) * self.span > MOST_TURNED
+    @property
+    def latest(self) -> float:
+        """How late it is at the end, or early before the longest recording begins."""
+        return abs(self.strength[0]) * max(abs(at - self.begin) for at in self.seen)
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
         """Return whose clock it is."""

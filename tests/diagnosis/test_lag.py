@@ -152,9 +152,10 @@ def test_without_velocities_a_lag_is_not_corrected_and_said_to_be_left_out():
     assert any(line.startswith("lag of u2: 0.0") for line in cause.elsewhere)
 
 
-def test_a_missing_velocity_concerns_the_sensor_that_lags_alone():
+def test_a_missing_velocity_is_taken_from_those_around_it_where_a_sensor_lags():
     late = WAYS["lag"](effect=find("sensor-lag"), sites=(1,), strength=(0.1,))
     v = np.ones((4, 3))
     v[2] = np.nan
     found = corrected(Model(DECLARED, 2, TRUTH, (late,)), Samples(T[:4], np.zeros((4, 3)), v, ends="free"), 0)
-    np.testing.assert_allclose(found.u, [[0, 0.1, 0], [0, 0.1, 0], [0, np.nan, 0], [0, 0.1, 0]], atol=1e-12)
+    np.testing.assert_allclose(found.u, [[0, 0.1, 0], [0, 0.1, 0], [0, 0.1, 0], [0, 0.1, 0]], atol=1e-12)
+    np.testing.assert_array_equal(np.isnan(found.v), np.isnan(v))

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench.diagnosis.acting import WAYS
-from latticebench.diagnosis.cure import corrected
+from latticebench.diagnosis.cure import corrected, staying
 from latticebench.diagnosis.fitting import Fitted, fit
 from latticebench.diagnosis.glance import _looked, _Pull
 from latticebench.diagnosis.horizon import Layout
@@ -192,12 +192,42 @@ def test_beside_crosstalk_forces_are_glanced_at_as_they_are_felt_by_all_sensors_
         np.testing.assert_allclose(short, long, rtol=1e-7, atol=1e-7 * np.max(np.abs(long)))
 
 
-def test_a_missing_reading_is_missing_in_those_that_hear_it_alone_when_readings_are_put_right():
+def test_missing_readings_and_no_others_are_missing_when_readings_are_put_right():
     hears = WAYS["crosstalk"](effect=find("sensor-crosstalk"), heard=(-1,), both=False, strength=(0.1,))
     samples = mixed(0.1, -1)
-    holed = replace(samples, u=np.where(np.arange(SITES) == 1, np.nan, samples.u))
-    again = corrected(Model(DECLARED, 2, TRUTH, (hears,)), holed, 0)
-    assert np.isnan(again.u[:, 1]).all()
-    np.testing.assert_allclose(again.u[:, 0], samples.u[:, 0])
-    u = corrected(Model(DECLARED, 2, TRUTH, (hears,)), samples, 0).u
-    np.testing.assert_allclose(u, exact()(T), atol=6 * NOISE)
+    gone = (np.arange(len(T))[:, None] == 100) & (np.arange(SITES) == 1)
+    for lost in (gone, np.arange(SITES) == 1):
+        holed = replace(samples, u=np.where(lost, np.nan, samples.u))
+        again = corrected(Model(DECLARED, 2, TRUTH, (hears,)), holed, 0)
+        np.testing.assert_array_equal(np.isnan(again.u), np.isnan(holed.u))
+        np.testing.assert_allclose(again.u[:, 0], samples.u[:, 0])
+    # Where one reading is missing, what is heard of it is taken from those before and after.
+    u = corrected(Model(DECLARED, 2, TRUTH, (hears,)), replace(samples, u=np.where(gone, np.nan, samples.u)), 0).u
+    assert np.nanmax(np.abs(u - exact()(T))) < 6 * NOISE
+
+
+def test_what_makes_readings_late_stays_where_together_it_turns_a_swing_too_far():
+    samples = replace(readings(exact()(T)), v=np.gradient(exact()(T), T, axis=0))
+    lag = WAYS["lag"](effect=find("sensor-lag"), sites=(1,), strength=(0.15,), omega=4.3)
+    slow = WAYS["sensor clock"](
+        effect=find("sensor-clock"), sites=(1,), begin=0.0, seen=(0.0, T[-1]), strength=(0.0075,), omega=4.3
+    )
+    for late, stays in (((lag,), []), ((slow,), []), ((lag, slow), [lag, slow])):
+        assert staying(late, velocities=True) == stays
+        assert staying(late, velocities=False) == list(late)
+        again = corrected(Model(DECLARED, 2, TRUTH, late), samples, 0)
+        assert np.max(np.abs(again.u - samples.u)) < 1
+    later = replace(slow, seen=(0.0, 10 * T[-1]))
+    assert staying([later], velocities=True) == [later]
+
+
+def test_of_two_sensors_one_is_slow_or_the_other_one_fast_and_of_three_one_or_both_others():
+    for sites, places in ((2, [(1,)]), (3, [(0,), (1,), (2,)]), (4, [(0,), (1,), (2,), (3,), (2, 3)])):
+        u = np.cos(4 * T[:, None] + np.arange(sites))
+        problem = Problem.of(DECLARED, 2, [Samples(T, u, ends="free")], [find("sensor-clock")])
+        assert [one.sites for one in problem.candidates] == places
+        # Velocities tell of the unit of time.
+        problem = Problem.of(
+            DECLARED, 2, [Samples(T, u, np.gradient(u, T, axis=0), ends="free")], [find("sensor-clock")]
+        )
+        assert (0,) in [one.sites for one in problem.candidates]

@@ -36,9 +36,10 @@ POWERS = {
     "onsite-quadratic": -1, "onsite-cubic": -2, "onsite-quintic": -4, "quadratic-coupling": -1,
     "nonlinear-coupling": -2, "quadratic-drag": -1, "nonlinear-damping": -2, "dry-friction": 1, "constant-force": 1,
     "drive": 1, "local-drive": 1, "sensor-curve": -2, "sensor-saturation": -3, "sensor-gain": -1,
+    "sensor-crosstalk": -1, "sensor-gain-drift": -1,
 }  # fmt: skip
 # The label of what a single sensor has.
-SENSOR = r"(offset|gain|curve|lag|jump|drift of the gain|delay) of u(\d+)(?: and v\d+)?(?: per time)?"
+SENSOR = r"(offset|gain|curve|lag|jump|growth of the gain|delay) of u(\d+)(?: and v\d+)?(?: per time)?"
 # The label of a wave, and minus the time since which its phase is counted.
 WAVE = r"(?:hum of u\d*, )?(cos|sin)\(.*\*(?:t|\(t([+-][^()]*)\))\)"
 # The label of a declared term whose coefficient changes steadily.
@@ -52,7 +53,7 @@ NAMED = {
     "cubic curve of u": "cubic",
     "scale": "scale",
     "share of both neighbours in each reading": "crosstalk",
-    "drift of the gain": "fade",
+    "growth of the gain": "fade",
     "delay": "slow",
 }
 # Half the width of a 95 % interval, in standard errors.
