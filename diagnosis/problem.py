@@ -139,23 +139,15 @@ class Problem:
         past = tuple(
             course(one.t, split_parts(field[0], first.is_complex)) for one, field in zip(data, states, strict=True)
         )
+        seen = float(min(one.t[0] for one in data)), float(max(one.t[-1] for one in data))
         scene = Scene(
-            chain,
-            float(longest.t[0]),
-            span,
-            (float(min(one.t[0] for one in data)), float(max(one.t[-1] for one in data))),
-            top,
-            _frequencies(top, span, step),
-            _beside(fast, FARTHER * top, span),
-            past,
-            declared.texts,
-            first.f is not None,
+            chain, float(longest.t[0]), span, seen, top, _frequencies(top, span, step),
+            _beside(fast, FARTHER * top, span), past, declared.texts, first.f is not None,
             # Of windows of one recording, none has a zero of its own.
             tuple(map(_read, data)) if len(parts) == len(free) and 1 < len(free) <= SEVERAL else (),
-            step,
-            float(spectrum.peaks[0]) if len(spectrum.peaks) else 0.0,
+            step, float(spectrum.peaks[0]) if len(spectrum.peaks) else 0.0,
             max(float(np.nanmax(np.abs(one.u))) for one in data),
-        )
+        )  # fmt: skip
         candidates = tuple(one for effect in catalogue for one in way_of(effect).places(effect, scene))
         return cls(
             declared, order, data, chain, plain, records, nodes, splines, spectrum, step, scene, candidates,

@@ -87,6 +87,7 @@ class Cyclic(OfSensors, acts="cyclic"):
 
     def sentences(self, chain: Chain) -> list[str]:
         """Return how large the error is, and after which difference it repeats."""
-        which = "all sensors" if len(self.sites) == chain.sites else f"the sensor of u{self.sites[0] + 1}"
+        alike = 1 < len(self.sites) == chain.sites
+        which = "all sensors" if alike else f"the sensor of u{self.sites[0] + 1}"
         size, cycle = abs(complex(*self.strength)), 2 * np.pi / abs(self.per_reading)
         return [f"{which}: an error of {size:.{DIGITS}g} to either side that repeats after {cycle:.{DIGITS}g}"]

@@ -76,7 +76,7 @@ def _forms(effect: Effect, chain: Chain) -> list[Placed]:
     """An effect as it may stand in a model on a chain, in each of its forms, with numbers of its own."""
     scene: Any = SimpleNamespace(
         chain=chain, begin=0.0, span=30.0, seen=(0.0, 30.0), middle=15.0, top=4.0, frequencies=np.array([1.7234567]),
-        recordings=((0, 1, 2), (0, 1, 2)), step=0.05, main=3.0,
+        recordings=((0, 1, 2), (0, 1, 2)), step=0.05, main=3.0, largest=1.0,
         fast=(), inputs=True,
         past=(lambda t: np.zeros((len(t), chain.parts, chain.sites)),), texts=("u[n+1]+u[n-1]-2*u[n]", "sin(u[n])"),
         terms=lambda one: one.texts(chain.order, chain.is_complex),
