@@ -150,6 +150,16 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     assert f"`results/loop/held-nothing`) {share(still['false alarms'])} had an effect named" in words("diagnosis")
     change = pd.read_csv(RESULTS / "loop" / "change" / "summary.csv", comment="#", dtype=str)
     assert f"`results/loop/change`): {share(change['right'].iloc[0])}." in words("diagnosis")
+    sensors = pd.read_csv(RESULTS / "loop" / "sensors" / "summary.csv", comment="#", dtype=str).iloc[0]
+    assert f"`results/loop/sensors`): {share(sensors['right'])}, and" in words("diagnosis")
+    assert f"and intervals hold the true size in {share(sensors['intervals that hold'])}. A gain" in words("diagnosis")
+    effects = pd.read_csv(RESULTS / "loop" / "sensors" / "effects.csv", comment="#", dtype=str).set_index("effect")
+    named = {name: share(effects.loc[f"sensor-{name}", "named"]) for name in ("gain-drift", "clock", "crosstalk")}
+    assert f"drifts was named in {named['gain-drift']}, a slow clock in {named['clock']}, crosstalk in" in words(
+        "diagnosis"
+    )
+    assert f"crosstalk in {named['crosstalk']}: of less" in words("diagnosis")
+    assert effects.loc["sensor-crosstalk", "z 5-10"].startswith("60.0 ")
     effects = pd.read_csv(RESULTS / "loop" / "change" / "effects.csv", comment="#", dtype=str).set_index("effect")
     assert f"steady were named in {share(effects.loc['coefficient-drift', 'named'])}" in words("diagnosis")
     assert f"those at one time in {share(effects.loc['coefficient-jump', 'named'])}" in words("diagnosis")
