@@ -56,7 +56,7 @@ class Crosstalk(Placed, acts="crosstalk"):
 
     @property
     def possible(self) -> bool:
-        """Whether each sensor hears its own site more than twice as loud as all others together."""
+        """Whether each sensor hears its own site more than twice as much as others."""
         return abs(self.strength[0]) * max(len(self.heard), 1) < MOST
 
     def labels(self, chain: Chain) -> tuple[str, ...]:  # noqa: ARG002
@@ -76,7 +76,6 @@ class Crosstalk(Placed, acts="crosstalk"):
         mixed = np.zeros((levels, parts * sites, parts * sites))
         for place in self.heard:
             here, there = slice(max(-place, 0), sites - max(place, 0)), slice(max(place, 0), sites - max(-place, 0))
-            # A missing reading is missing in those that it is heard in alone.
             by[:, concerned, :, here] += field[:, concerned, :, there]
             mixed[concerned] += np.kron(np.eye(parts), np.eye(sites, k=place))
         if not self.heard:

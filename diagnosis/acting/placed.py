@@ -83,8 +83,8 @@ class Misreading:
         slope: its derivative by the reading's own field, likewise; dimensionless.
         by: its derivatives by the numbers of the effect (numbers, rows, levels, parts, N).
         by_rates: those by v and its rate (rows, levels, 2, parts, N), but for the reading's own field; None for 0.
-        by_others: those by the same field at other sites, or of the other part, a row for each reading (levels,
-            parts * N, parts * N); None for 0.
+        by_others: those by the same field at other sites, or of the other part, as far as that is heard, a row for each
+            reading (levels, parts * N, parts * N); None for 0.
     """
 
     added: Float[ndarray, "rows levels parts sites"]

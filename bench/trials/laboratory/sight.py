@@ -224,11 +224,8 @@ class Experiment:
 
         chain, sites = self.chain, self.chain.sites
         start = np.stack([np.concatenate([of[f"start.{level}.{k}"] for k in range(sites)], axis=1) for level in (0, 1)])
-        outer, sensors, beyond = (
-            self._outer,
-            _Sensors(of, sites, float(self.times[-1])),
-            _Beyond.of(of, self._outer, self._border),
-        )
+        outer, beyond = self._outer, _Beyond.of(of, self._outer, self._border)
+        sensors = _Sensors(of, sites, float(self.times[-1]))
         known = ("start.", "border.")
         moving = {name: value for name, value in of.items() if not name.startswith(known) and np.any(value != 0)}
 

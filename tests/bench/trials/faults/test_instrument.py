@@ -32,6 +32,8 @@ def drawn(name, effect, z=15, **options):
 
 
 LIE_ABOUT_BOTH = (
+    "sensor-gain-drift",
+    "sensor-gain-jump",
     "other: neighbour-crosstalk",
     "other: flickering-lamp",
     "other: averaging-readout",
@@ -69,6 +71,26 @@ def test_the_zero_of_one_sensor_wanders_in_steps_that_know_nothing_of_one_anothe
     steps = np.diff(walk[:, site])
     assert np.std(steps) > 0
     assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 4 / np.sqrt(len(steps))
+
+
+@pytest.mark.parametrize("name", BOTH)
+def test_the_gain_of_one_sensor_changes_steadily_or_at_one_time(name):
+    for effect in ("sensor-gain-drift", "sensor-gain-jump"):
+        shown, true, one = lied(name, effect)
+        t, site = one.clean.t, int(one.about["site"])
+        steady = (t - t[0]) / (t[-1] - t[0])
+        grown = np.real(one.amount) * (steady if effect == "sensor-gain-drift" else t > one.about["at"])
+        expected = true * (1 + np.outer(grown, np.arange(true.shape[1]) == site))
+        np.testing.assert_allclose(shown, expected, atol=1e-12)
+        assert np.ptp(grown) > 0
+
+
+def test_one_sensor_is_read_by_a_slow_clock():
+    shown, true, one = lied("phi4", "sensor-clock", samples=100)
+    t, site, slow = one.clean.t, int(one.about["site"]), np.real(one.amount)
+    field = CubicHermiteSpline(t, true, one.clean.v)
+    expected = np.where(np.arange(true.shape[1]) == site, field(np.clip(t - slow * (t - t[0]), t[0], None)), true)
+    np.testing.assert_allclose(shown, expected, atol=0.01 * np.max(np.abs(shown - true)))
 
 
 @pytest.mark.parametrize("name", BOTH)
