@@ -169,6 +169,28 @@ def test_unlike_quadratures_are_named_with_their_ratio_and_their_angle():
     assert np.max(np.abs(again.u - unit * z)) < 0.06
 
 
+@pytest.mark.slow
+def test_a_gain_that_drifts_beside_unknown_ends_is_named_with_what_it_is_at_first():
+    t, sites = np.linspace(0, 30, 301), 6
+
+    def rate(_t, y):
+        u, v = np.split(y, 2)
+        return np.concatenate([v, 0.5 * (beside(u) - 2 * u) - u])
+
+    start = np.concatenate([np.cos(1.7 * np.arange(sites)), np.zeros(sites)])
+    u = solve_ivp(rate, t[[0, -1]], start, t_eval=t, rtol=1e-10, atol=1e-11).y.T[:, 1:5]
+    u = u * (1 + 0.2 * np.outer(np.linspace(-1, 1, len(t)), [0, 1, 0, 0]))
+    samples = Samples(t, u + 0.005 * np.random.default_rng(0).normal(size=u.shape), source="chain", ends="unknown")
+    names = ("damping", "sensor-offset", "sensor-gain", "sensor-gain-drift")
+    declared = library("plain", "u[n+1]+u[n-1]-2*u[n]; u[n]")
+    found = diagnose(declared, 2, [samples], [find(name) for name in names])
+    values = {one.name: next(iter(one.values.values())) for one in found.findings}
+    assert found.verdict == "explained"
+    for name, true in (("sensor-gain", -0.2), ("sensor-gain-drift", 0.4)):
+        assert values.pop(name)[0] == pytest.approx(true, abs=0.015)
+    assert not values
+
+
 def plain_fit(samples: Samples, placed) -> tuple[Problem, Fitted]:
     problem = Problem.of(DECLARED, 2, [samples], CATALOGUE)
     layout = replace(Layout.of(problem, 100, None, NOISE))

@@ -158,8 +158,8 @@ def test_what_acts_at_one_site_or_bond_is_named_where_it_is(name, force):
 @pytest.mark.slow
 def test_what_misreads_in_time_beside_unknown_ends_is_fitted():
     def read(u):
-        return u * (1 + 0.2 * np.outer(np.linspace(-1, 1, len(u)), np.eye(u.shape[1])[1]))
+        return u * (1 + 0.1 * np.sin(np.linspace(0, 9, len(u))))[:, None]
 
     found = diagnosed(chain(ends="unknown", sites=4, read=read), ("damping", "sensor-offset"))
     assert found.verdict in ("unexplained", "partly explained")
-    assert ("a gain that drifts", 1) in [(one.name, one.site) for one in found.left]
+    assert found.left[0].name == "a gain of its own course in time, common to all sensors"
