@@ -33,6 +33,8 @@ class Cyclic(OfSensors, acts="cyclic"):
     per_reading: float
     largest: float
     shape: ClassVar[tuple[str, ...]] = ("per_reading",)
+    # On short pieces, an error that repeats with the reading does what many a force does.
+    slow: ClassVar[bool] = True
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
