@@ -82,12 +82,7 @@ class ClockJump(Sudden, Late, acts="clock jump"):
 
     def courses(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return the velocity from the jump on and, for time and width, its derivatives by them; to first order."""
-        (lost,), wide = self.strength, self.wide
-        found = [Force("v[n]", lost, {0: 1.0}, None, Rise(self.at, wide))]
-        if lost:
-            found.append(Force("v[n]", 0.0, {1: lost / wide}, None, Rise(self.at, wide, 0)))
-            found.append(Force("v[n]", 0.0, {2: lost * self.width / wide**2}, None, Rise(self.at, wide, 1)))
-        return found
+        return self.rising("v[n]")
 
     @property
     def latest(self) -> float:
@@ -100,9 +95,8 @@ class ClockJump(Sudden, Late, acts="clock jump"):
 
     def lateness(self, t: ndarray, sites: int) -> tuple[ndarray, ndarray]:  # noqa: ARG002
         """Return how late readings are, which is less than not at all, and its derivatives by the numbers."""
-        (lost,), wide = self.strength, self.wide
-        rise, by_time, by_width = (Rise(self.at, wide, power)(t)[0, :, :, None] for power in (None, 0, 1))
-        return -lost * rise, -np.stack([rise, lost / wide * by_time, lost * self.width / wide**2 * by_width])
+        by = -self.risen(t)[:, :, None, None]
+        return self.strength[0] * by[0], by
 
     def told(self, t: ndarray) -> ndarray:
         """Return the times with what was lost."""

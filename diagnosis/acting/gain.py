@@ -17,15 +17,35 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Gain(OfSensors, acts="gain"):
-    """The reading is (1 + strength) u, with a strength for each of some sites.
+class OfGain(OfSensors):
+    """What scales the readings of some sensors.
 
     Attributes:
         both: whether velocities are read so, too.
-        alike: whether all of them have the same.
     """
 
     both: bool
+
+    @property
+    def place(self) -> tuple[object, ...]:
+        """The effect, the sites, the recording, and whether velocities are concerned."""
+        return (*super().place, self.both)
+
+    def column(self, site: int, chain: Chain) -> str:
+        """Return the columns that a site's sensor writes and that are concerned."""
+        if chain.is_complex:
+            return f"re{site + 1} and im{site + 1}"
+        return f"u{site + 1}" + (f" and v{site + 1}" if self.both else "")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gain(OfGain, acts="gain"):
+    """The reading is (1 + strength) u, with a strength for each of some sites.
+
+    Attributes:
+        alike: whether all of them have the same.
+    """
+
     alike: bool = False
 
     @classmethod
@@ -49,11 +69,6 @@ class Gain(OfSensors, acts="gain"):
                     effect=effect, sites=read, recording=recording, both=chain.levels > 1, alike=True, strength=(0.0,)
                 )
 
-    @property
-    def place(self) -> tuple[object, ...]:
-        """The effect, the sites, the recording, and whether velocities are concerned."""
-        return (*super().place, self.both)
-
     def turned(self) -> Placed | None:
         """Return the sensor with the other sign."""
         return None if self.site is None or self.alike else self.moved([-2.0 - self.strength[0]])
@@ -62,12 +77,7 @@ class Gain(OfSensors, acts="gain"):
         """Return the columns that are read wrongly."""
         if self.alike:
             return (f"gain of all sensors{self.then}",)
-        return tuple(f"gain of {self._column(site, chain)}" for site in self.sites)
-
-    def _column(self, site: int, chain: Chain) -> str:
-        if chain.is_complex:
-            return f"re{site + 1} and im{site + 1}"
-        return f"u{site + 1}" + (f" and v{site + 1}" if self.both else "")
+        return tuple(f"gain of {self.column(site, chain)}" for site in self.sites)
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:  # noqa: ARG002
         """Return what the factors add."""
@@ -84,7 +94,7 @@ class Gain(OfSensors, acts="gain"):
         if self.alike:
             return {f"factor of all sensors{self.then}": 1 + self.strength[0]}
         pairs = zip(self.sites, self.strength, strict=True)
-        return {f"factor of {self._column(site, chain)}": 1 + value for site, value in pairs}
+        return {f"factor of {self.column(site, chain)}": 1 + value for site, value in pairs}
 
     def sentences(self, chain: Chain) -> list[str]:
         """Return the factors."""
@@ -92,7 +102,7 @@ class Gain(OfSensors, acts="gain"):
             return [f"all sensors read {1 + self.strength[0]:.{DIGITS}g} times as much{self.then} as in others"]
         found = []
         for site, value in zip(self.sites, self.strength, strict=True):
-            factor, column = 1 + value, self._column(site, chain)
+            factor, column = 1 + value, self.column(site, chain)
             turned = "; it looks from the other side" if factor < 0 else ""
             found.append(f"the sensor of {column} reads {factor:.{DIGITS}g} times what the others' unit says{turned}")
         return found

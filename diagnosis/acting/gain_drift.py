@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Misreading, OfSensors, Placed
+from latticebench.diagnosis.acting.gain import OfGain
+from latticebench.diagnosis.acting.placed import DIGITS, Misreading, Placed
 from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
 
@@ -17,17 +18,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class GainDrift(OfSensors, acts="gain drift"):
+class GainDrift(OfGain, acts="gain drift"):
     """The reading is (1 + c (t - t_0) / T) u, T being the length of the longest recording.
 
     Attributes:
         begin, span: t_0 and T.
-        both: whether velocities are read so, too.
     """
 
     begin: float
     span: float
-    both: bool
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
@@ -41,16 +40,9 @@ class GainDrift(OfSensors, acts="gain drift"):
                     effect=effect, sites=(site,), begin=scene.begin, span=scene.span, both=both, strength=(0.0,)
                 )  # fmt: skip
 
-    @property
-    def place(self) -> tuple[object, ...]:
-        """The effect, the site, and whether velocities are concerned."""
-        return (*super().place, self.both)
-
     def labels(self, chain: Chain) -> tuple[str, ...]:
         """Return the columns whose gain drifts."""
-        site = self.sites[0] + 1
-        column = f"re{site} and im{site}" if chain.is_complex else f"u{site}" + (f" and v{site}" if self.both else "")
-        return (f"growth of the gain of {column}",)
+        return (f"growth of the gain of {self.column(self.sites[0], chain)}",)
 
     @property
     def possible(self) -> bool:

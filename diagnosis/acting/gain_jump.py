@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from latticebench.diagnosis.acting.gain import OfGain
 from latticebench.diagnosis.acting.jump import BETWEEN, SHARP
-from latticebench.diagnosis.acting.placed import DIGITS, Force, Misreading, OfSensors, Placed
+from latticebench.diagnosis.acting.placed import DIGITS, Force, Misreading, Placed
 from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
 from latticebench.diagnosis.acting.scene import Chain, Scene
-from latticebench.diagnosis.acting.sudden import Rise, Sudden
+from latticebench.diagnosis.acting.sudden import Sudden
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
@@ -21,14 +22,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class GainJump(Sudden, OfSensors, acts="gain jump"):
-    """The reading is (1 + c (1 + tanh((t - at) / width)) / 2) u: an amplifier that changes its range.
-
-    Attributes:
-        both: whether velocities are read so, too.
-    """
-
-    both: bool
+class GainJump(Sudden, OfGain, acts="gain jump"):
+    """The reading is (1 + c (1 + tanh((t - at) / width)) / 2) u: an amplifier that changes its range."""
 
     @classmethod
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
@@ -45,16 +40,9 @@ class GainJump(Sudden, OfSensors, acts="gain jump"):
                         both=both, strength=(0.0,),
                     )  # fmt: skip
 
-    @property
-    def place(self) -> tuple[object, ...]:
-        """The effect, the site, and whether velocities are concerned."""
-        return (*super().place, self.both)
-
     def labels(self, chain: Chain) -> tuple[str, ...]:
         """Return the columns whose gain changes."""
-        site = self.sites[0] + 1
-        column = f"re{site} and im{site}" if chain.is_complex else f"u{site}" + (f" and v{site}" if self.both else "")
-        return (f"change of the gain of {column}",)
+        return (f"change of the gain of {self.column(self.sites[0], chain)}",)
 
     @property
     def possible(self) -> bool:
@@ -67,22 +55,15 @@ class GainJump(Sudden, OfSensors, acts="gain jump"):
 
     def courses(self, chain: Chain) -> list[Force]:
         """Return what is read more from the change on and, for time and width, its derivatives by them."""
-        (more,), wide, share = self.strength, self.wide, self.share(chain)
-        found = [Force("u[n]", more, {0: 1.0}, share, Rise(self.at, wide))]
-        if more:
-            found.append(Force("u[n]", 0.0, {1: more / wide}, share, Rise(self.at, wide, 0)))
-            found.append(Force("u[n]", 0.0, {2: more * self.width / wide**2}, share, Rise(self.at, wide, 1)))
-        return found
+        return self.rising("u[n]", weights=self.share(chain))
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:
         """Return what the gain adds."""
-        (more,), wide = self.strength, self.wide
-        rise, by_time, by_width = (Rise(self.at, wide, power)(t)[0, :, 0] for power in (None, 0, 1))
-        courses = np.stack([rise, more / wide * by_time, more * self.width / wide**2 * by_width])
+        (more,), courses = self.strength, self.risen(t)
         by, slope = np.zeros((3, *field.shape)), np.zeros_like(field)
         here = (slice(None), slice(None if self.both else 1), slice(None), self.sites[0])
         by[(slice(None), *here)] = courses[:, :, None, None] * field[here]
-        slope[here] = more * rise[:, None, None]
+        slope[here] = more * courses[0][:, None, None]
         return Misreading(more * by[0], slope, by)
 
     def sentences(self, chain: Chain) -> list[str]:

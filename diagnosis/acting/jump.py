@@ -11,7 +11,7 @@ import numpy as np
 from latticebench.diagnosis.acting.placed import DIGITS, Force, Misreading, OfSensors, Placed
 from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
 from latticebench.diagnosis.acting.scene import Chain, Scene
-from latticebench.diagnosis.acting.sudden import Rise, Sudden
+from latticebench.diagnosis.acting.sudden import Sudden
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
@@ -57,25 +57,14 @@ class Jump(Sudden, OfSensors, acts="jump"):
 
     def courses(self, chain: Chain) -> list[Force]:
         """Return the jump and, for time and width, its derivatives by them."""
-        wide, share, found = self.wide, self.share(chain), []
-        for part, (text, value) in enumerate(zip(("1", "i*1"), self.strength, strict=False)):
-            found.append(Force(text, value, {part: 1.0}, share, Rise(self.at, wide)))
-            if value:
-                by_width = value * self.width / wide**2
-                found.append(Force(text, 0.0, {self.parts: value / wide}, share, Rise(self.at, wide, 0)))
-                found.append(Force(text, 0.0, {self.parts + 1: by_width}, share, Rise(self.at, wide, 1)))
-        return found
+        share = self.share(chain)
+        return [one for part in range(self.parts) for one in self.rising(("1", "i*1")[part], part, share)]
 
     def misread(self, t: ndarray, field: ndarray) -> Misreading:
         """Return where the zero is, and what each number adds."""
-        wide = self.wide
-        course, by_time, by_width = (Rise(self.at, wide, power)(t)[0, :, 0] for power in (None, 0, 1))
         by = np.zeros((self.count, *field.shape))
-        for part, value in enumerate(self.strength):
-            here = (slice(None), 0, part, self.sites[0])
-            by[(part, *here)] = course
-            by[(self.parts, *here)] = value / wide * by_time
-            by[(self.parts + 1, *here)] = value * self.width / wide**2 * by_width
+        for part in range(self.parts):
+            by[[part, self.parts, self.parts + 1], :, 0, part, self.sites[0]] = self.risen(t, part)
         return Misreading(np.tensordot(self.strength, by[: self.parts], 1), np.zeros_like(field), by)
 
     def sentences(self, chain: Chain) -> list[str]:

@@ -11,7 +11,7 @@ from latticebench.diagnosis.acting.placed import DIGITS, Force, Placed
 from latticebench.diagnosis.acting.pulse import MOST_MIDDLES
 from latticebench.diagnosis.acting.ramp import changing
 from latticebench.diagnosis.acting.scene import Chain, Scene
-from latticebench.diagnosis.acting.sudden import Rise, Sudden
+from latticebench.diagnosis.acting.sudden import Sudden
 from latticebench.systems.effects import Effect
 
 # The width of a step over the shortest time in which the motion changes by a radian: what moves has no time to notice
@@ -51,13 +51,7 @@ class Step(Sudden, acts="step"):
 
     def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return the step and, for time and width, its derivatives by them."""
-        wide, value = self.wide, self.strength[0]
-        found = [Force(self.text, value, {0: 1.0}, None, Rise(self.at, wide))]
-        if value:
-            by_width = value * self.width / wide**2
-            found.append(Force(self.text, 0.0, {1: value / wide}, None, Rise(self.at, wide, 0)))
-            found.append(Force(self.text, 0.0, {2: by_width}, None, Rise(self.at, wide, 1)))
-        return found
+        return self.rising(self.text)
 
     def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
         """Return by how much the coefficient changes, and when."""

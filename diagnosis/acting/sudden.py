@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import InStep, Placed, since
+from latticebench.diagnosis.acting.placed import Force, InStep, Placed, since
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
     from numpy import ndarray
 
 
@@ -81,3 +82,19 @@ class Sudden(Placed):
     def wide(self) -> float:
         """The width with which it is computed."""
         return float(np.hypot(self.width, self.least))
+
+    def rising(self, text: str, number: int = 0, weights: Float[ndarray, " sites"] | None = None) -> list[Force]:
+        """Return a term that rises with one of the strengths and, for time and width, its derivatives by them."""
+        value, count, wide = self.strength[number], len(self.strength), self.wide
+        found = [Force(text, value, {number: 1.0}, weights, Rise(self.at, wide))]
+        if value:
+            by_width = value * self.width / wide**2
+            found.append(Force(text, 0.0, {count: value / wide}, weights, Rise(self.at, wide, 0)))
+            found.append(Force(text, 0.0, {count + 1: by_width}, weights, Rise(self.at, wide, 1)))
+        return found
+
+    def risen(self, t: Float[ndarray, " rows"], number: int = 0) -> Float[ndarray, "3 rows"]:
+        """Return the rise, and by how much one of the strengths times it changes with time and width."""
+        value, wide = self.strength[number], self.wide
+        rise, by_time, by_width = (Rise(self.at, wide, power)(t)[0, :, 0] for power in (None, 0, 1))
+        return np.stack([rise, value / wide * by_time, value * self.width / wide**2 * by_width])
