@@ -44,7 +44,7 @@ class Cure:
     Attributes:
         terms: the declared ones and, after them, those that were found, each where and when it acts.
         ends: how the chain ends.
-        left_out: the effects that no term can say: memory, a clock.
+        left_out: the effects that no term can say: memory, a clock, what is not read.
     """
 
     terms: tuple[str, ...]
@@ -75,7 +75,7 @@ def _terms(placed: Placed, model: Model, chain: Chain) -> list[str] | None:
         whole = combination(model.declared.terms, model.coefficients).text
         return [f"{_where(np.eye(chain.sites)[site])}*({whole})"]
     forces = placed.forces(chain)
-    if not forces or placed.fed:
+    if not forces or placed.fed or placed.resonator(chain) is not None:
         return None
     sums: list[list[str]] = [[] for _ in placed.strength]
     for force in forces:

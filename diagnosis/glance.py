@@ -159,6 +159,8 @@ def _dual(tangent: Tangent, number: int, readings: ndarray, rates: ndarray | Non
             by_state[:, :, :, level] += one
         by_state[:, :, :, 1] += by_v
     by_state = by_state.reshape(pieces, m, count, -1)
+    unread = np.zeros((pieces, m, count, along.states.shape[1] - layout.plain.read))
+    by_state = np.concatenate([by_state, unread], axis=-1)
     back = np.swapaxes(tangent.followed.transitions[number][:, ::-1], 2, 3)
     carried = propagate(back, by_state[:, -2::-1], by_state[:, -1])[:, ::-1]
     dual = np.zeros((pieces, m, chain.parts, len(chain.moving), count))

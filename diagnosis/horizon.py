@@ -199,7 +199,7 @@ class Layout:
             # Errors add up along a piece; a slow loss of amplitude would be taken for a damping.
             least = self.small * min(0.3, TOGETHER / y.shape[1])
             levels = [least, least * top][: self.plain.order]
-            tolerance = np.repeat(levels, assembled.dynamics.parts * assembled.dynamics.count)
+            tolerance = assembled.dynamics.sized(levels)
             flat = y[:, :-1].reshape(-1, y.shape[-1])
             stretches = self.stretches(number, assembled)
             # In a single step through a gap the motion would be lost.
@@ -347,7 +347,7 @@ class _Gaps:
     def of(cls, layout: Layout, number: int, assembled: Assembled, splines: ndarray | None) -> _Gaps:
         dynamics, record = assembled.dynamics, layout.records[number]
         levels = [layout.small, layout.small / float(np.median(np.diff(record.times)))][: dynamics.order]
-        units = np.repeat(levels, dynamics.parts * dynamics.count)
+        units = dynamics.sized(levels)
         return cls(layout, number, assembled, layout.stretches(number, assembled), units, splines)
 
     def closed_along(self, near: ndarray, by_state: ndarray) -> ndarray | None:

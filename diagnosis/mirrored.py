@@ -91,7 +91,7 @@ def images(problem: Problem, fitted: Fitted) -> Iterator[tuple[Model, list[Float
     if problem.chain.sites != 2 or not repelling(problem, fitted.model):
         return
     sign = np.tile([1.0, -1.0], problem.chain.order)
-    near = [nodes * sign for nodes in fitted.followed.nodes]
+    near = [nodes[..., : problem.plain.read] * sign for nodes in fitted.followed.nodes]
     for plain, (site, turned_over) in itertools.product(_attracting(problem, fitted.model), _sensors(problem)):
         if site == 0:
             continue

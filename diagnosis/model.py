@@ -11,6 +11,7 @@ import numpy as np
 
 from latticebench.diagnosis.acting import Chain, Placed
 from latticebench.methods.engine.dynamics import Dynamics, Factor
+from latticebench.methods.engine.resonator import Resonator
 from latticebench.systems.lattice import Library
 from latticebench.systems.stencil import Ends
 from latticebench.systems.terms import Term
@@ -33,12 +34,12 @@ class Assembled:
     Attributes:
         dynamics: the terms with weights and factors.
         coefficients: of the terms.
-        slope: derivatives of the coefficients by the model's numbers.
+        slope: derivatives of the coefficients and, after these, of the numbers of resonators by the model's numbers.
     """
 
     dynamics: Dynamics
     coefficients: Float[ndarray, " terms"]
-    slope: Float[ndarray, "terms numbers"]
+    slope: Float[ndarray, "varied numbers"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +150,9 @@ class Model:
         for k, (text, value) in enumerate(zip(self.declared.texts, self.coefficients, strict=True)):
             found.add(text, value, {k: 1.0})
         for placed, block in zip(self.effects, self.blocks, strict=True):
+            if (one := placed.resonator(chain)) is not None:
+                found.hang(one, block)
+                continue
             for force in placed.forces(chain):
                 by = {block.start + k: value for k, value in force.by.items()}
                 found.add(force.text, force.coefficient, by, force.weights, force.factor_of(recording))
@@ -174,6 +178,7 @@ class _Sum:
         self.slopes: list[ndarray] = []
         self.weights: list[ndarray] = []
         self.factors: list[Factor | None] = []
+        self.resonators: list[tuple[Resonator, slice]] = []
 
     def add(
         self,
@@ -190,6 +195,10 @@ class _Sum:
         self.slopes.append(slope)
         self.weights.append(np.ones(self.sites) if weights is None else weights)
         self.factors.append(factor)
+
+    def hang(self, resonator: Resonator, block: slice) -> None:
+        """Add what is not read, whose numbers are those of a block."""
+        self.resonators.append((resonator, block))
 
     def scale(self, site: int, strength: float, number: int) -> None:
         """Multiply all that acts at a site by 1 + strength; the derivative by it is what acts there."""
@@ -216,5 +225,7 @@ class _Sum:
             weights=None if np.all(weights == 1) else weights,
             factors=tuple(self.factors) if any(self.factors) else None,
             ends=ends,
+            resonators=tuple(one for one, _ in self.resonators),
         )
-        return Assembled(dynamics, np.array(self.coefficients), np.stack(self.slopes))
+        unread = [np.eye(self.numbers)[block] for _, block in self.resonators]
+        return Assembled(dynamics, np.array(self.coefficients), np.concatenate([np.stack(self.slopes), *unread]))

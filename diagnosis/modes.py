@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from latticebench.methods.engine.dynamics import Dynamics
 
 # Modes that are listed, at most.
 MOST_MODES = 8
@@ -77,7 +76,8 @@ def _linearised(fitted: Fitted, number: int, t: ndarray, states: ndarray) -> Flo
     """Return the matrix of the linear equation nearest to a model along states (T, S) of one recording."""
     layout = fitted.layout
     assembled, stretches = fitted.model.assembled(layout.plain, layout.chain, number), layout.records[number].stretches
-    mirrored = _mirrored(states, assembled.dynamics)
+    signs = assembled.dynamics.mirror
+    mirrored = np.concatenate([states, states * signs]) if np.any(signs < 0) else states
     t, states = np.tile(t, len(mirrored) // len(states)), mirrored
     mean, count = np.mean(states, axis=0), states.shape[1]
     step = np.maximum(np.std(states, axis=0), SMALLEST * float(np.sqrt(np.mean(states**2))) + 1e-300)
@@ -97,15 +97,3 @@ def _linearised(fitted: Fitted, number: int, t: ndarray, states: ndarray) -> Flo
     gram = moved.T @ moved / len(moved) + WHERE_IT_LEADS * np.eye(count)
     slopes = slopes + np.linalg.solve(gram, moved.T @ forced / len(moved))
     return np.asarray(slopes.T / step)
-
-
-def _mirrored(states: Float[ndarray, "time state"], dynamics: Dynamics) -> Float[ndarray, "times state"]:
-    """Return states and their mirror images in time: velocities or, of a complex field, imaginary parts reversed."""
-    back = states.reshape(len(states), dynamics.order, dynamics.parts, dynamics.count).copy()
-    if dynamics.order == 2:
-        back[:, 1] *= -1
-    elif dynamics.parts == 2:
-        back[:, :, 1] *= -1
-    else:
-        return states
-    return np.concatenate([states, back.reshape(states.shape)])

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latticebench.diagnosis.acting import Chain, Placed
+from latticebench.diagnosis.acting.scene import Course
 from latticebench.diagnosis.fitting import Fitted, fit
 from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.problem import Problem, course
+from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.readout import unread
-from latticebench.methods.engine.dynamics import Factor
+from latticebench.methods.engine.resonator import Resonator
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -28,24 +30,77 @@ if TYPE_CHECKING:
 ROUNDS, SETTLED = 4, 1.0
 
 
-def past_of(
+def known(
     problem: Problem, layout: Layout, model: Model, nodes: Sequence[Float[ndarray, "pieces m state"]]
-) -> tuple[Factor, ...]:
-    """Return the field of each recording as a function of times: along the pieces their states, else what was read."""
+) -> list[Float[ndarray, "time state"]]:
+    """Return the states of each recording at all its times: along the pieces theirs, else what was read."""
     found = []
     for number, (rows, valid, states) in enumerate(zip(layout.rows, layout.valid, nodes, strict=True)):
         every = np.array(unread(model, layout, number, problem.nodes[number]))
-        every[rows[valid]] = states[valid]
+        every[rows[valid]] = states[valid][:, : layout.plain.read]
+        found.append(every)
+    return found
+
+
+def past_of(
+    problem: Problem, layout: Layout, model: Model, nodes: Sequence[Float[ndarray, "pieces m state"]]
+) -> tuple[Course, ...]:
+    """Return the field of each recording as a function of times."""
+    found = []
+    for number, every in enumerate(known(problem, layout, model, nodes)):
         record = layout.records[number]
         driven = record.stretches.driven(record.times, layout.splines[number])
-        found.append(course(record.times, layout.plain.whole(every, driven)[:, 0]))
+        found.append(Course.of(record.times, layout.plain.whole(every, driven)[:, 0]))
     return tuple(found)
+
+
+def _hanging(model: Model, chain: Chain) -> list[Placed]:
+    """Return the effects of which a part is not read."""
+    return [one for one in model.effects if one.resonator(chain) is not None]
+
+
+def beside(
+    model: Model, chain: Chain, past: Course, t: Float[ndarray, "*rows"], states: Float[ndarray, "*rows read"]
+) -> Float[ndarray, "*rows state"]:
+    """Return states of a recording with those of what is not read, as far as its past tells."""
+    return np.concatenate([states, *(one.unread(past, t) for one in _hanging(model, chain))], axis=-1)
+
+
+def with_unread_of(fitted: Fitted, number: int, states: Float[ndarray, "time read"]) -> Float[ndarray, "time state"]:
+    """Return states of a recording with those of what a fit knows and is not read."""
+    layout, nodes = fitted.layout, fitted.followed.nodes[number]
+    if nodes.shape[-1] == layout.plain.read:
+        return states
+    record = layout.records[number]
+    driven = record.stretches.driven(record.times, layout.splines[number])
+    past = Course.of(record.times, layout.plain.whole(states, driven)[:, 0])
+    found = beside(fitted.model, layout.chain, past, record.times, states)
+    rows, valid = layout.rows[number], layout.valid[number]
+    found[rows[valid], layout.plain.read :] = nodes[valid][:, layout.plain.read :]
+    return found
+
+
+def with_unread(
+    problem: Problem, layout: Layout, model: Model, near: Sequence[Float[ndarray, "pieces m read"]]
+) -> tuple[Float[ndarray, "pieces m state"], ...]:
+    """Return states with those of what is not read; as they are where they have these already."""
+    chain, read = layout.chain, layout.plain.read
+    hanging = _hanging(model, chain)
+    if near[0].shape[-1] == read + Resonator.size * len(hanging):
+        return tuple(near)
+    seen = tuple(one[..., :read] for one in near)
+    if not hanging:
+        return seen
+    times = (record.times[rows] for record, rows in zip(layout.records, layout.rows, strict=True))
+    pasts = past_of(problem, layout, model, seen)
+    return tuple(beside(model, chain, *each) for each in zip(pasts, times, seen, strict=True))
 
 
 def settled(
     problem: Problem, model: Model, layout: Layout, near: Sequence[Float[ndarray, "pieces m state"]], **settings: Any
 ) -> Fitted | None:
     """Return the fit of a model (see `fit`, which has these settings) whose past, if it is fed, is its own motion."""
+    near = with_unread(problem, layout, model, near)
     if not any(one.fed for one in model.effects):
         return fit(model, layout, near, **settings)
     last = np.inf

@@ -12,12 +12,13 @@ import numpy as np
 
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acting import Chain, Placed, Scene, way_of
+from latticebench.diagnosis.acting.scene import Course
 from latticebench.diagnosis.held import Held, freed
 from latticebench.diagnosis.instrument import of_readings, quietest, step_of
 from latticebench.diagnosis.spectrum import Spectrum, hidden, lines, mean_step
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.engine.derivatives import DEGREE, differentiate
-from latticebench.methods.engine.dynamics import Dynamics, Factor, split_parts
+from latticebench.methods.engine.dynamics import Dynamics, split_parts
 from latticebench.methods.engine.record import Record
 from latticebench.methods.engine.sensitivity import Stretches
 from latticebench.methods.engine.starts import smooth
@@ -137,7 +138,7 @@ class Problem:
         if _relaxes(spectrum, span, chain):
             top = max([top, *(_rate(one[:, :own], samples.t) for one, samples in zip(nodes, data, strict=True))])
         past = tuple(
-            course(one.t, split_parts(field[0], first.is_complex)) for one, field in zip(data, states, strict=True)
+            Course.of(one.t, split_parts(field[0], first.is_complex)) for one, field in zip(data, states, strict=True)
         )
         seen = float(min(one.t[0] for one in data)), float(max(one.t[-1] for one in data))
         scene = Scene(
@@ -389,19 +390,6 @@ def _record(
     inputs = None if forced is None else forced.forcing()
     stretches = Stretches(plain, samples.t[:-1], samples.t[1:], inputs, drive, held=True)
     return Record(stretches, np.where(np.isfinite(value), value, 0.0), seen, samples.t), splines
-
-
-def course(t: Float[ndarray, " time"], field: Float[ndarray, "time parts sites"]) -> Factor:
-    """Return the field as a function of times, (B,) -> (parts, B, N), constant before and after the recording."""
-    from scipy.interpolate import CubicSpline
-
-    curve = CubicSpline(t, field)
-    begin, end = float(t[0]), float(t[-1])
-
-    def past(t: ndarray) -> ndarray:
-        return np.moveaxis(np.asarray(curve(np.clip(t, begin, end))), 0, 1)
-
-    return past
 
 
 def _frequencies(top: float, span: float, step: float) -> Float[ndarray, " frequencies"]:

@@ -20,6 +20,7 @@ from latticebench.diagnosis.held import Held, freed
 from latticebench.diagnosis.inputs import in_words
 from latticebench.diagnosis.instrument import dead_sensors, describe, without
 from latticebench.diagnosis.modes import Mode
+from latticebench.diagnosis.past import with_unread_of
 from latticebench.diagnosis.problem import Problem, derivative_share
 from latticebench.diagnosis.progress import Found, Horizon
 from latticebench.diagnosis.readout import unread
@@ -444,10 +445,12 @@ def _dynamics(problem: Problem, fitted: Fitted) -> float:
         assembled = fitted.model.assembled(problem.plain, problem.chain, number)
         dynamics, t = assembled.dynamics, record.times
         states = unread(fitted.model, fitted.layout, number, nodes)
-        f = None if record.stretches.inputs is None else record.stretches.inputs(t)
         driven = record.stretches.driven(t, splines)
+        states = with_unread_of(fitted, number, states)
+        f = None if record.stretches.inputs is None else record.stretches.inputs(t)
         with np.errstate(all="ignore"):
             rate = dynamics.linear(assembled.coefficients, t, states, f, driven, derivatives=False)[0]
+        rate = rate[:, : dynamics.read]
         shape = (len(t), dynamics.order, dynamics.parts, dynamics.count)
         right.append(rate.reshape(shape)[:, -1])
         seen = np.where(record.seen, record.value, np.nan)[..., problem.plain.moving]

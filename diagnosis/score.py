@@ -144,7 +144,7 @@ class Tangent:
         stretches = replace(layout.stretches(number, assembled), dynamics=wide)
         flat = y[:, :-1].reshape(-1, size)
         found = stretches.vary(coefficients, flat, layout.rounds(number), followed.splines[number], dense=True)
-        unit = found.by_coefficient[:, len(dynamics.terms) :]
+        unit = found.by_coefficient[:, len(dynamics.terms) :][:, : len(pushed)]
         unit = unit.reshape(pieces, m - 1, chain.parts, 2, len(chain.moving), size)
         t = record.times[rows]
         h = np.diff(t, axis=1)[:, :, None, None, None]
@@ -227,6 +227,10 @@ class Tangent:
             near.append(nodes + (varied[:, None, None] @ moves)[:, :, 0])
             if not placed.instrument:
                 near[-1] += (own @ self._moved(number, [placed])).reshape(nodes.shape)
+            hanging = [one.resonator(layout.chain) for one in (placed, *(model.effects[k] for k in dropped))]
+            if dropped and any(hanging):
+                # What is not read is another one.
+                near[-1] = near[-1][..., : layout.plain.read]
         moved = model.moved(model.numbers + change)
         for number in sorted(dropped, reverse=True):
             moved = moved.without(number)
@@ -283,7 +287,8 @@ class Tangent:
                 projected = vectors[:, held].T @ slopes[block]
                 numbers, freedom = vectors[:, held] @ (projected / values[held]), int(np.sum(held))
                 won = float(np.sum(projected**2 / values[held]))
-                if one.effect.takes and numbers[0] > 0:
+                hangs = one.resonator(self.fitted.chain) is not None
+                if (one.effect.takes and numbers[0] > 0) or (hangs and numbers[0] < 0):
                     won, numbers = 0.0, 0 * numbers
                 one = one.moved(one.numbers + numbers / unit[block])
             does[:, k], can[:, k] = part @ numbers, shared[:, block] @ numbers
@@ -354,7 +359,7 @@ class Tangent:
         site, ends = one.scaled(), one.other_ends()
         if site is not None:
             index = chain.moving.index(site)
-            push[0, :, :, index] = self._rate(number, dynamics)[..., index]
+            push[0, :, :, index] = self._rate(number, replace(dynamics, resonators=()))[..., index]
         if ends is not None:
             push[0] = self._rate(number, replace(dynamics, ends=ends)) - self._rate(number, dynamics)
         for force in one.forces(chain):
@@ -375,7 +380,8 @@ class Tangent:
         rate = dynamics.linear(
             along.assembled.coefficients, along.t, along.states, self._input(number), along.driven, derivatives=False
         )[0]
-        return np.asarray(rate.reshape(len(along.t), chain.order, chain.parts, -1)[:, -1])
+        rate = rate[:, : dynamics.read].reshape(len(along.t), chain.order, chain.parts, -1)
+        return np.asarray(rate[:, -1])
 
     def _input(self, number: int) -> ndarray | None:
         inputs = self.fitted.layout.records[number].stretches.inputs

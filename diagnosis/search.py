@@ -23,7 +23,7 @@ from latticebench.diagnosis.mirrored import images, mirrored
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.moments import beside
 from latticebench.diagnosis.noise import Structure
-from latticebench.diagnosis.past import past_of, settled
+from latticebench.diagnosis.past import past_of, settled, with_unread, with_unread_of
 from latticebench.diagnosis.pool import Pool
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.progress import Found, Horizon, Tried
@@ -215,8 +215,8 @@ class Search:
         for number, rows in enumerate(layout.rows):
             nodes = np.array(unread(fitted.model, layout, number, self.problem.nodes[number]))
             old, valid = fitted.layout.rows[number], fitted.layout.valid[number]
-            nodes[old[valid]] = fitted.followed.nodes[number][valid]
-            near.append(nodes[rows])
+            nodes[old[valid]] = fitted.followed.nodes[number][valid][:, : layout.plain.read]
+            near.append(with_unread_of(fitted, number, nodes)[rows])
         ready = layout.with_substeps(fitted.model, near, self.problem.top)
         return self.refit(fitted.model, ready, near, fitted, steps, hope)
 
@@ -236,6 +236,7 @@ class Search:
         """
         if not model.rubs:
             return self._refit(model, layout, near, start, steps, hope)
+        near = with_unread(self.problem, layout, model, near)
         known = soft = self.problem.plain.rest
         least = np.inf
         if start is not None and start.model.rubs:
@@ -372,7 +373,8 @@ class Search:
         for numbers, one in (*every, *in_place(self.problem, self.tangent(fitted))):
             model = functools.reduce(Model.without, sorted(numbers, reverse=True), fitted.model).with_effect(one)
             if model not in pool:
-                cheaper = sum(self.problem.price_of(effects[k]) for k in numbers) - self.problem.price_of(one)
+                own = Worth(self.problem, fitted)
+                cheaper = sum(own.price_of(effects[k]) for k in numbers) - own.price_of(one)
                 hope = fitted.cost + fitted.dispersion * (max(cheaper, 0.0) + unlikely(fitted))
                 other = self.exchanged(fitted, numbers, one, hope)
                 if other is not None:
@@ -432,7 +434,8 @@ class Search:
             layout = self.layout(length)
             if found is None:
                 every = (unread(model, layout, number, nodes) for number, nodes in enumerate(self.problem.nodes))
-                near = [nodes[rows] for nodes, rows in zip(every, layout.rows, strict=True)]
+                seen = [nodes[rows] for nodes, rows in zip(every, layout.rows, strict=True)]
+                near = with_unread(self.problem, layout, model, seen)
                 ready = layout.with_substeps(model, near, self.problem.top)
                 found = self.refit(model, ready, near, fitted, FIRST)
             else:

@@ -1,8 +1,11 @@
-"""Effects that swing at one frequency, and one that does what they do.
+"""Effects that swing at one frequency, or act at one site, and one that does what they do.
 
 A force at one site and one at all of the same frequency, opposite to each other, move one site alone: so does the hum
 of its sensor. No exchange of one effect leads from these two to that one. A force that pushes harder than all else does
 what the hum of a sensor does, too.
+
+A mass that hangs beside a site and is not read is felt there as another mass or another spring, as long as it swings at
+nearly one frequency, and as forces of that frequency.
 """
 
 from __future__ import annotations
@@ -13,12 +16,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from latticebench.diagnosis.acting import Placed
+from latticebench.diagnosis.acting.side_mass import SideMass
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.score import Tangent
 from latticebench.diagnosis.worth import pushed
 
 # A candidate may take the place of effects if it can do this share of what they do.
 MOST_OF_IT = 0.9
+# What is not read may take the place of all at its site if it can do this share, its frequency being known roughly; so
+# many frequencies are tried.
+SOME_OF_IT, BEST = 0.5, 3
 # Forces push harder than all else where that costs more nats.
 HARD = 1.0
 
@@ -27,8 +34,10 @@ def in_place(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ..
     """Yield the numbers of effects of a model that swing together, with the candidate that does most of what they do.
 
     These are any two, and any one where forces push harder than all else. Frequencies are one where they differ by less
-    than half of what the longest recording resolves. Besides, each may have a more general case (`Placed.general`).
+    than half of what the longest recording resolves. Besides, each may have a more general case (`Placed.general`), and
+    what hangs beside a site may be in the place of several effects there.
     """
+    yield from _at_a_site(problem, tangent)
     effects = tangent.fitted.model.effects
     swinging = [k for k, one in enumerate(effects) if one.frequency is not None]
     for k in swinging:
@@ -55,3 +64,19 @@ def in_place(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ..
         best = max(without.scored(others), key=lambda one: one.won)
         if best.won > MOST_OF_IT * without.taken > 0:
             yield some, best.placed
+
+
+def _at_a_site(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ...], Placed]]:
+    """Yield the numbers of all effects of a model at a site, where there are several, with what may hang there."""
+    effects, chain = tangent.fitted.model.effects, problem.chain
+    for site in range(chain.sites):
+        here = tuple(k for k, one in enumerate(effects) if one.site == site and not one.instrument)
+        if len(here) < 2:
+            continue
+        coarse = [one for one in problem.candidates if isinstance(one, SideMass) and one.site == site]
+        hanging = [each for one in coarse for each in (one, *one.sharper())]
+        without = tangent.in_place_of(here)
+        scored = sorted(without.scored(hanging), key=lambda one: -one.won) if hanging else []
+        for one in scored[:BEST]:
+            if one.won > SOME_OF_IT * without.taken > 0:
+                yield here, one.placed

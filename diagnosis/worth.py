@@ -15,6 +15,7 @@ from latticebench.diagnosis.glance import crowding
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.score import Tangent
+from latticebench.methods.engine.resonator import Resonator
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -108,7 +109,8 @@ def pushed(fitted: Fitted) -> float:
     where it acts.
     """
     effects = fitted.model.effects
-    own = [one for one in effects if one.timed and not one.instrument]
+    # What hangs beside a site and is not read pushes as hard as it is pushed.
+    own = [one for one in effects if one.timed and not one.instrument and one.resonator(fitted.chain) is None]
     if not own:
         return 0.0
     plain = replace(fitted.model, effects=tuple(one for one in effects if one not in own))
@@ -137,7 +139,8 @@ def _rates(fitted: Fitted, model: Model) -> Float[ndarray, "rows channels"]:
         inputs = None if record.stretches.inputs is None else record.stretches.inputs(t)
         driven = layout.driven(number, fitted.followed.splines[number])
         rate = assembled.dynamics.linear(assembled.coefficients, t, states, inputs, driven, derivatives=False)[0]
-        rates.append(rate.reshape(len(t), layout.plain.order, -1)[layout.valid[number].ravel(), -1])
+        rate = rate[:, : layout.plain.read].reshape(len(t), layout.plain.order, -1)
+        rates.append(rate[layout.valid[number].ravel(), -1])
     return np.concatenate(rates)
 
 
@@ -193,8 +196,11 @@ class Worth:
         return -float(np.log1p(-rules.SHARE)) * readings, -float(np.log1p(-rules.SHARE_TIMED)) * readings
 
     def price_of(self, placed: Placed) -> float:
-        """Return the nats that an effect must bring."""
-        return max(self.problem.price_of(placed), self.least[placed.timed])
+        """Return the nats that an effect must bring; where it begins on each piece wins a nat for two numbers, too."""
+        free = 0.0
+        if self.best is not None and placed.resonator(self.problem.chain) is not None:
+            free = Resonator.size / 2 * self.best.pieces
+        return max(self.problem.price_of(placed) + free, self.least[placed.timed])
 
     def price(self, fitted: Fitted) -> float:
         """Return the price of a model: of its effects and of the noise's parameters."""

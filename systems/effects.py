@@ -25,6 +25,7 @@ HOW: dict[str, str] = {
     "the longest recording; term found",
     "step": "a declared term, or the formula, from one time on; term and time found",
     "delayed": "the formula of the field a delay earlier; delay found",
+    "side mass": "a mass that is not read, on a spring and a dashpot at one site; site, frequency and damping found",
     "long range": "sum over r >= 2 of (u_{n+r} + u_{n-r} - 2 u_n) / r^s; s found",
     "alternating": "the formula with the sign (-1)^k at site k",
     "one site": "the formula at one site only; site found",
@@ -300,6 +301,11 @@ CATALOGUE: tuple[Effect, ...] = (
     Effect(
         "local-kick", "1", acts="pulse at one site",
         look_for="a residual that begins at one time and site, and spreads", source=NAYFEH,
+    ),
+    Effect(
+        "side-mass", "u[n]", complex_field="", acts="side mass", orders=(2,),
+        look_for="a line of one site's own, with another phase above it than below", source="Den Hartog, Mechanical "
+        "Vibrations (1956), section 3.2",
     ),
     Effect(
         "unequal-masses", "u[n]", acts="one equation",

@@ -93,6 +93,8 @@ def of_natural(name: str, units: Units, order: int = 2) -> tuple[float, str]:
         return 1 / units.scale, units.reading
     if name == "omega":
         return 1.0, rate_of("rad", units.time)
+    if name in ("gamma", "drag"):
+        return 1.0, rate_of("1", units.time)
     if name in TIMES or name.endswith(" time") or name.startswith("lag "):
         return 1.0, units.time
     try:

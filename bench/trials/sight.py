@@ -22,7 +22,8 @@ import numpy as np
 from latticebench.bench.trials.faults.setting import Fields
 from latticebench.bench.trials.information import beside, explained
 from latticebench.diagnosis.acting import Chain, Force, Placed, Scene, way_of
-from latticebench.methods.engine.dynamics import Dynamics, Factor, split_parts
+from latticebench.diagnosis.acting.scene import Course
+from latticebench.methods.engine.dynamics import Dynamics, split_parts
 from latticebench.methods.engine.sensitivity import Stretches, Transition
 from latticebench.systems.effects import CATALOGUE
 from latticebench.systems.errors import InputError
@@ -275,20 +276,8 @@ class Sight:
         every = np.arange(1.0, 3 * top * span / np.pi) * np.pi / span
         texts = tuple(term.text for term in self.dynamics.terms)
         field = self.dynamics.whole(line.nodes, None)[:, 0]
-        past = (_past(self.times, field),)
+        past = (Course.of(self.times, field),)
         return Scene(chain, begin, span, (begin, begin + span), top, every, np.empty(0), past, texts, False)
-
-
-def _past(times: ndarray, field: Float[ndarray, "time parts sites"]) -> Factor:
-    """Return a field as a function of times (B,) -> (parts, B, N); before the first time it stands still."""
-    from scipy.interpolate import CubicSpline
-
-    curve = CubicSpline(times, field)
-
-    def past(t: ndarray) -> ndarray:
-        return np.moveaxis(curve(np.clip(t, times[0], times[-1])), 0, 1)
-
-    return past
 
 
 def _last_beside_others(rows: Float[ndarray, "parameters readings"]) -> tuple[float, ndarray]:

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.scene import Chain, Scene
+from latticebench.diagnosis.acting.scene import Chain, Course, Scene
 from latticebench.methods.engine.dynamics import Factor
+from latticebench.methods.engine.resonator import Resonator
 from latticebench.systems.effects import HOW, Effect
 from latticebench.systems.stencil import Ends
 
@@ -221,7 +222,7 @@ class Placed(ABC):
         return True
 
     def with_past(self, past: tuple[Factor, ...]) -> Self:  # noqa: ARG002
-        """Return it with another field at earlier times, (B,) -> (parts, B, N) of each recording, where it is fed."""
+        """Return it with another field at earlier times of each recording, where that matters to it."""
         return self
 
     def share(self, chain: Chain) -> Float[ndarray, " sites"] | None:  # noqa: ARG002
@@ -231,6 +232,14 @@ class Placed(ABC):
     def forces(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return the terms that it adds to the right-hand side."""
         return []
+
+    def resonator(self, chain: Chain) -> Resonator | None:  # noqa: ARG002
+        """Return what swings beside a site, unread, in the place of forces; its numbers are all of the effect's."""
+        return None
+
+    def unread(self, past: Course, t: Float[ndarray, "pieces m"]) -> Float[ndarray, "pieces m numbers"]:
+        """Return about where what is not read would be, if it was at rest as the recording began, and its rate."""
+        raise NotImplementedError(f"all of {self.effect.name} is read")
 
     def courses(self, chain: Chain) -> list[Force]:  # noqa: ARG002
         """Return what it adds to readings of u in time: terms "1", "i*1", "u[n]", "v[n]" with their factors."""

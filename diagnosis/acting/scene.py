@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from latticebench.methods.engine.dynamics import Factor
 from latticebench.systems.effects import Effect
 from latticebench.systems.stencil import Ends
 from latticebench.systems.terms import Term
@@ -15,11 +15,48 @@ from latticebench.systems.terms import Term
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
+    from scipy.interpolate import CubicSpline
 
 # On fewer sites a dependence on the place cannot be told from what single sites have.
 PLACES = 4
 # A round time near the middle of a recording is a multiple of the power of ten below this share of its span.
 OF_THE_SPAN = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """A field that is known as a curve, constant before and after it.
+
+    Attributes:
+        curve: u (T, parts, N).
+        begin, end: its first and its last time.
+    """
+
+    curve: CubicSpline
+    begin: float
+    end: float
+
+    @classmethod
+    def of(cls, t: Float[ndarray, " time"], field: Float[ndarray, "time parts sites"]) -> Course:
+        """Return the smooth curve through a field at some times."""
+        from scipy.interpolate import CubicSpline
+
+        return cls(CubicSpline(t, field), float(t[0]), float(t[-1]))
+
+    def __call__(self, t: ndarray) -> Float[ndarray, "parts times sites"]:
+        """Return u at times."""
+        return np.moveaxis(np.asarray(self.curve(np.clip(t, self.begin, self.end))), 0, 1)
+
+    def sampled(self, step: float) -> Float[ndarray, "parts grid sites"]:
+        """Return u from the first time on in steps, to the last time or just beyond it; kept for the last step."""
+        if step not in self._kept:
+            self._kept.clear()
+            self._kept[step] = self(self.begin + step * np.arange(int((self.end - self.begin) / step) + 2))
+        return self._kept[step]
+
+    @functools.cached_property
+    def _kept(self) -> dict[float, ndarray]:
+        return {}
 
 
 @dataclass(frozen=True)
@@ -61,7 +98,7 @@ class Scene:
         top: the highest angular frequency that the readings plainly show.
         frequencies: angular frequencies that an outside influence may have.
         fast: angular frequencies beyond these, about lines that sensors show: too fast for what moves a chain.
-        past: the smoothed field of each recording as a function of times, (B,) -> (parts, B, N).
+        past: the smoothed field of each recording.
         texts: the declared terms.
         inputs: whether an input was measured.
         recordings: the sites that were read in each recording, where each may have zeros and units of its own.
@@ -77,7 +114,7 @@ class Scene:
     top: float
     frequencies: Float[ndarray, " frequencies"]
     fast: Float[ndarray, " frequencies"]
-    past: tuple[Factor, ...]
+    past: tuple[Course, ...]
     texts: tuple[str, ...]
     inputs: bool
     recordings: tuple[tuple[int, ...], ...] = ()

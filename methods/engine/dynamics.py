@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from latticebench.methods.engine.resonator import Resonator
 from latticebench.systems.compiler import Compiled, Slot, compiled, partials
 from latticebench.systems.errors import InputError
 from latticebench.systems.stencil import Ends, Stencil, numbers
@@ -38,7 +39,7 @@ FIELDS, INPUT, TIMES, NUMBERS = range(4)
 class Dynamics:
     """The equation of motion of a chain.
 
-    A state consists of S = order * parts * M numbers: u, or Re u and Im u, of the M sites that have an equation and,
+    A state consists of order * parts * M numbers: u, or Re u and Im u, of the M sites that have an equation and,
     for order 2, their velocities likewise. All N sites have an equation unless the ends are unknown; then only those do
     whose whole stencil lies inside the chain.
 
@@ -54,6 +55,7 @@ class Dynamics:
         least_reach: least width of the stencil to the left and to the right. With it, equations of different terms
             leave the same sites without an equation at unknown ends.
         rest: speed below which dry friction is viscous; 0 to take its mean over a step.
+        resonators: of which nothing is read; their y and y' come after u and v in the state.
     """
 
     terms: tuple[Term, ...]
@@ -65,6 +67,7 @@ class Dynamics:
     factors: tuple[Factor | None, ...] | None = None
     least_reach: tuple[int, int] = (0, 0)
     rest: float = 0.0
+    resonators: tuple[Resonator, ...] = ()
 
     @functools.cached_property
     def reach(self) -> tuple[int, int]:
@@ -93,9 +96,29 @@ class Dynamics:
         return len(self.stencil.own)
 
     @property
+    def read(self) -> int:
+        """The length of the part of a state that is u and v."""
+        return self.order * self.parts * self.count
+
+    @property
     def size(self) -> int:
         """The length S of a state."""
-        return self.order * self.parts * self.count
+        return self.read + sum(one.size for one in self.resonators)
+
+    def sized(self, levels: Sequence[float]) -> Float[ndarray, " state"]:
+        """Return sizes of u and, for order 2, of v as those of a whole state; what is not read has the same."""
+        own = [np.repeat(levels, self.parts * self.count), *(np.asarray(levels) for _ in self.resonators)]
+        return np.concatenate(own)
+
+    @property
+    def mirror(self) -> Float[ndarray, " state"]:
+        """The signs that the numbers of a state change as time goes back: -1 for velocities and imaginary parts."""
+        blocks = np.ones((self.order, self.parts, self.count))
+        if self.order == 2:
+            blocks[1] = -1
+        else:
+            blocks[:, 1:] = -1
+        return np.concatenate([blocks.ravel(), *(np.array([1.0, -1.0]) for _ in self.resonators)])
 
     @functools.cached_property
     def border(self) -> Int[ndarray, " border"]:
@@ -106,7 +129,7 @@ class Dynamics:
         """Write u (T, N) and, for order 2, v (T, N) as states; a v that is None counts as zero."""
         fields = [u] if self.order == 1 else [u, np.zeros_like(u) if v is None else v]
         blocks = [split_parts(one[:, self.moving], self.is_complex) for one in fields]
-        return np.stack(blocks, axis=1).reshape(len(u), self.size)
+        return np.stack(blocks, axis=1).reshape(len(u), self.read)
 
     def linear(
         self,
@@ -158,14 +181,34 @@ class Dynamics:
         found: dict[tuple[int, Slot], ndarray] = {}
         rate = np.empty((len(t), self.order, self.parts, self.count))
         if self.order == 2:
-            rate[:, 0] = y.reshape(rate.shape)[:, 1]
+            rate[:, 0] = y[:, : self.read].reshape(rate.shape)[:, 1]
         if step is not None and self._rubbing:
             found = self._softened(coefficients, values, rate[:, 0, 0], step, factors, derivatives)
         summed = np.matmul(coefficients, values.reshape(self.parts, len(self.terms), -1))
         rate[:, -1] = summed.reshape(self.parts, *shape).swapaxes(0, 1)
         if derivatives:
             self._add_slopes(found, read, coefficients, factors)
-        return rate.reshape(y.shape), values, found
+        return self._with_unread(rate.reshape(len(t), -1), y), values, found
+
+    def _with_unread(self, rate: Float[ndarray, "batch read"], y: Float[ndarray, "batch state"]) -> ndarray:
+        """Return the rates with those of the resonators, and with what these do to their sites."""
+        if not self.resonators:
+            return rate
+        later = np.empty_like(y)
+        later[:, : self.read] = rate
+        for one, places in zip(self.resonators, self.beside, strict=True):
+            own, pushed = one.rates(y[:, places].T)
+            later[:, places[0]], later[:, places[1]] = y[:, places[1]], own
+            later[:, places[3]] += pushed
+        return later
+
+    @functools.cached_property
+    def beside(self) -> tuple[list[int], ...]:
+        """Where y, y', u and v of each resonator and its site are in a state."""
+        first = self.read
+        return tuple(
+            [first + 2 * k, first + 2 * k + 1, one.site, self.count + one.site] for k, one in enumerate(self.resonators)
+        )
 
     def acting(self, coefficients: Float[ndarray, " terms"]) -> tuple[Dynamics, Float[ndarray, " terms"]]:
         """Return the equation of the terms whose coefficients are not zero, on the same sites, and these."""
@@ -304,7 +347,7 @@ class Dynamics:
 
     def whole(self, y: ndarray, driven: ndarray | None) -> ndarray:
         """Return the fields of all sites (..., order, parts, N); the border is 0 where `driven` is None."""
-        blocks = y.reshape(*y.shape[:-1], self.order, self.parts, self.count)
+        blocks = y[..., : self.read].reshape(*y.shape[:-1], self.order, self.parts, self.count)
         if len(self.border) == 0:
             return blocks
         whole = np.zeros((*blocks.shape[:-1], self.sites))

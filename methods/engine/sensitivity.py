@@ -51,7 +51,7 @@ class Transition:
     Attributes:
         end: states at the ends (K, S).
         by_state: d end / d start, (K, S, S), or one sparse (S, S) matrix per stretch for long chains.
-        by_coefficient: d end / d xi (K, P, S).
+        by_coefficient: d end / d xi and, after these, by the numbers of resonators (K, P, S).
         by_drive: d end / d (coefficients of the B-splines that are not zero in the stretch), (K, components * Q, S).
         first: the first of those Q B-splines (K,).
     """
@@ -183,7 +183,7 @@ class Stretches:
         """
         dynamics = self.dynamics
         far = 4 * max(1, *dynamics.reach)
-        while (colours := self._colours(far)) < dynamics.count:
+        while not dynamics.resonators and (colours := self._colours(far)) < dynamics.count:
             found = self.vary_in_groups(
                 coefficients, start, substeps, splines, colours, far, by_terms=by_terms, dense=dense
             )
@@ -195,6 +195,13 @@ class Stretches:
         )
         assert found is not None
         return found
+
+    @property
+    def _driving(self) -> int:
+        """The columns of the drive, which come last."""
+        if self.drive is None or self.held:
+            return 0
+        return self._active[1] * self.dynamics.parts * len(self.dynamics.border)
 
     def _colours(self, far: int) -> int:
         """Return how many groups keep sites of one group more than 2 `far` apart; all sites if that saves little."""
@@ -233,11 +240,9 @@ class Stretches:
         """
         dynamics = self.dynamics
         size, count, blocks = dynamics.size, dynamics.count, dynamics.order * dynamics.parts
-        states = blocks * colours
-        terms = len(dynamics.terms) if by_terms else 0
-        extra = 0
-        if self.drive is not None and not self.held:
-            extra = self._active[1] * dynamics.parts * len(dynamics.border)
+        states = blocks * colours + size - dynamics.read
+        terms = len(dynamics.terms) + sum(one.numbers for one in dynamics.resonators) if by_terms else 0
+        extra = self._driving
         seeds = self._seeds(states + terms + extra, colours)
         stretches = len(start)
         end = np.empty_like(start)
@@ -270,6 +275,8 @@ class Stretches:
         site, seeds = np.arange(count), np.zeros((columns, self.dynamics.size))
         for block in range(blocks):
             seeds[block * colours + site % colours, block * count + site] = 1.0
+        for number in range(self.dynamics.size - blocks * count):
+            seeds[blocks * colours + number, blocks * count + number] = 1.0
         return seeds
 
     def _march(
@@ -310,6 +317,7 @@ class Stretches:
                 if slopes_z is not None:
                     at = None if basis is None else basis[stage]
                     self._vary_rate(slopes_z[stage], at_z, values, slopes, at, chosen, by_terms=by_terms)
+                    self._vary_unread(slopes_z[stage], at_z, at_y, by_terms=by_terms)
             y = y + h[:, None] * _combine(b, slopes_y)
             if z is not None:
                 z = z + h * _combine(b, slopes_z)
@@ -346,7 +354,8 @@ class Stretches:
         order, parts, count = dynamics.order, dynamics.parts, dynamics.count
         columns, terms = len(z), len(dynamics.terms)
         batch = len(chosen)
-        blocks = z.reshape(columns, order, parts, count, batch)
+        unread = sum(one.numbers for one in dynamics.resonators) if by_terms else 0
+        blocks = z[:, : dynamics.read].reshape(columns, order, parts, count, batch)
         field, extra = blocks, 0
         if len(dynamics.border):
             field = np.zeros((columns, order, parts, dynamics.sites, batch))
@@ -364,12 +373,12 @@ class Stretches:
                     column = columns - extra + (place * parts + part) * len(border) + number
                     for level in range(order):
                         field[column, level, part, site, rows] = curves[level]
-        target = out.reshape(columns, order, parts, count, batch)
+        target = out[:, : dynamics.read].reshape(columns, order, parts, count, batch)
         if order == 2:
             target[:, 0] = blocks[:, 1]
         target[:, -1] = 0.0
         if len(slopes) > WIDE * parts**2 and not len(dynamics.border):
-            product = self._jacobian(slopes, batch) @ np.transpose(z, (2, 1, 0))
+            product = self._jacobian(slopes, batch) @ np.transpose(z[:, : dynamics.read], (2, 1, 0))
             target[:, -1] = np.transpose(product, (2, 1, 0)).reshape(target[:, -1].shape)
         else:
             padded = dynamics.stencil.pad(field, after=1)
@@ -377,8 +386,22 @@ class Stretches:
                 window = padded[dynamics.window(slot)]
                 target[:, -1, part] += (np.atleast_2d(slope).T if np.ndim(slope) else slope) * window
         if by_terms:
-            own = columns - extra - terms
+            own = columns - extra - unread - terms
             target[own : own + terms, -1] += np.transpose(values, (1, 0, 3, 2))
+
+    def _vary_unread(self, out: ndarray, z: Any, y: ndarray, *, by_terms: bool) -> None:
+        """Write d/dt of the resonators' derivatives, and add what they do to those of their sites."""
+        dynamics = self.dynamics
+        first = len(z) - self._driving - sum(one.numbers for one in dynamics.resonators)
+        for one, places in zip(dynamics.resonators, dynamics.beside, strict=True):
+            own, pushed = np.tensordot(one.slopes, z[:, places], (1, 1))
+            out[:, places[0]], out[:, places[1]] = z[:, places[1]], own
+            out[:, places[3]] += pushed
+            if by_terms:
+                for number, (own, pushed) in enumerate(one.by_numbers(y[:, places].T), first):
+                    out[number, places[1]] += own
+                    out[number, places[3]] += pushed
+                first += one.numbers
 
     def _jacobian(self, slopes: dict[tuple[int, Slot], ndarray], batch: int) -> Float[ndarray, "batch rate state"]:
         """Return the derivatives of the highest rates (parts, sites) by the states, for sites that couple to many."""
@@ -387,7 +410,7 @@ class Stretches:
         for (part, slot), slope in slopes.items():
             place, factor = dynamics.stencil.neighbours(slot.vector)
             found[:, part, sites, slot.place[0], slot.place[1], place] += slope * factor
-        return found.reshape(batch, dynamics.parts * dynamics.count, dynamics.size)
+        return found.reshape(batch, dynamics.parts * dynamics.count, dynamics.read)
 
     @functools.cached_property
     def _tableau(self) -> tuple[ndarray, ndarray, ndarray]:

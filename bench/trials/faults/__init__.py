@@ -116,6 +116,7 @@ CATALOGUED = {
     "unequal-masses": Fault(unseen.unequal_masses, real=True),
     "known-input": Fault(unseen.known_input),
     "memory": Fault(unseen.memory),
+    "side-mass": Fault(unseen.side_mass, "second order", real=True),
 }
 BLIND = {
     **_pushing(pushes.FIRST_BLIND),

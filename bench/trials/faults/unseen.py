@@ -39,6 +39,12 @@ def side_resonator(setting: Setting, amount: complex) -> Fields:
     return _with_resonators(setting, amount, setting.one[None], float(setting.drawn.about["own"]))
 
 
+def side_mass(setting: Setting, amount: complex) -> Fields:
+    """Hang a mass on one site by a spring; the amount is in units of the site's mass."""
+    own = float(setting.drawn.about["own"])
+    return _with_resonators(setting, amount * own**2, setting.one[None], own)
+
+
 def swaying_mount(setting: Setting, amount: complex) -> Fields:
     """Let the mount that all sites stand on sway."""
     hung = np.ones((1, setting.chain.sites))

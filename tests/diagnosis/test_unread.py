@@ -1,0 +1,103 @@
+"""A mass that hangs beside a site and is not read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from latticebench.diagnosis.acting.scene import Course
+from latticebench.diagnosis.acting.side_mass import SideMass
+from latticebench.diagnosis.cure import cure
+from latticebench.diagnosis.repair import diagnose
+from latticebench.systems.effects import CATALOGUE, find
+from latticebench.systems.lattice import library
+from latticebench.systems.samples import Samples
+
+SITES, NOISE, T = 3, 3e-3, np.linspace(0, 20, 601)
+DECLARED, COUPLING, GRAVITY, DAMPING = library("pendula", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])"), 3.0, -20.0, 0.04
+SOME = tuple(
+    find(name)
+    for name in ("damping", "defect", "unequal-masses", "local-damping", "local-drive", "memory", "side-mass")
+)
+
+
+def recording(mass=0.3, omega=4.6, gamma=0.05, drag=0.0, start=(0.1, 0.3), seed=5):
+    """Three pendula, at the first of which hangs a mass that moves as a recording begins; its place, too."""
+
+    def rate(_, y):
+        u, v, (place, speed) = y[:SITES], y[SITES:-2], y[-2:]
+        force = COUPLING * np.diff(np.r_[u[0], u, u[-1]], 2) + GRAVITY * np.sin(u) - DAMPING * v
+        pull = omega**2 * (place - u[0]) + gamma * (speed - v[0])
+        force[0] += mass * pull
+        return np.r_[v, force, speed, -pull - drag * speed]
+
+    begin = [0.4, 0.0, -0.2, *np.zeros(SITES), *start]
+    y = solve_ivp(rate, T[[0, -1]], begin, t_eval=T, rtol=1e-10, atol=1e-11).y.T
+    u = y[:, :SITES] + NOISE * np.random.default_rng(seed).normal(size=(len(T), SITES))
+    return Samples(T, u, source="pendula", ends="free"), y[:, -2]
+
+
+def checked(found, mass=0.3, omega=4.6):
+    """The placed mass of a diagnosis that has found it with the damping and nothing else."""
+    assert {one.name for one in found.findings} == {"damping", "side-mass"}
+    # Of some noise a little looks like more, in one of two hundred recordings.
+    assert found.verdict in ("explained", "partly explained")
+    assert found.residual[1] < 1.1
+    (one,) = (one for one in found.findings if one.name == "side-mass")
+    placed = one.placed
+    block = found.after.model.blocks[found.after.model.effects.index(placed)]
+    errors = found.after.stderr[block]
+    assert placed.here == 0
+    assert placed.strength[0] == pytest.approx(mass, abs=4 * errors[0])
+    assert placed.omega == pytest.approx(omega, abs=4 * errors[1])
+    assert errors[0] < 0.01 * mass
+    return placed
+
+
+@pytest.mark.slow
+def test_a_mass_that_hangs_beside_a_site_is_named_with_its_size_and_frequency_and_where_it_is_is_known():
+    samples, place = recording()
+    found = diagnose(DECLARED, 2, [samples], SOME)
+    placed = checked(found)
+    states = found.after.followed.nodes[0][found.after.layout.valid[0]]
+    assert np.std(states[:, -2] - place) < 0.02 * np.std(place)
+    # The forecast knows where the mass is, too.
+    assert found.forecast[1] < 1.5 * found.forecast_by_noise < 0.2 * found.forecast[0]
+    assert cure(found.after.model, found.after.chain).left_out == ("side-mass",)
+    # It makes one mode more.
+    assert [len(some) for some in found.modes[1:]] == [SITES, SITES + 1]
+    assert "not read" in placed.sentences(found.after.chain)[0]
+
+
+def test_a_candidate_knows_where_what_is_not_read_would_be():
+    samples, place = recording(drag=0.2, start=(0.4, 0.0))
+    past = Course.of(T, samples.u[:, None])
+    one = SideMass(
+        effect=find("side-mass"), here=0, omega=4.6, gamma=0.05, drag=0.2, past=(past,), step=T[1], strength=(0.3,)
+    )
+    where = one.unread(past, T[None])[0]
+    # It is noise that the smooth curve goes through: most of it is too fast for the mass.
+    assert np.std(where[:, 0] - place) < 0.1 * np.std(place)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [6, 7])
+def test_a_mass_that_is_not_read_is_found_among_all_effects(seed):
+    checked(diagnose(DECLARED, 2, [recording(seed=seed)[0]], CATALOGUE))
+
+
+@pytest.mark.slow
+def test_a_mass_that_swings_in_air_is_found_and_a_recording_without_any_mass_has_none():
+    found = diagnose(DECLARED, 2, [recording(0.06, 5.0, 0.0, 0.15)[0]], CATALOGUE)
+    checked(found, 0.06, 5.0)
+    without = diagnose(DECLARED, 2, [recording(0.0)[0]], CATALOGUE)
+    assert [one.name for one in without.findings] == ["damping"]
+
+
+@pytest.mark.slow
+def test_of_two_recordings_each_has_a_mass_that_begins_elsewhere():
+    every = [recording()[0], replace(recording(start=(-0.2, 0.5), seed=8)[0], source="again")]
+    checked(diagnose(DECLARED, 2, every, SOME))
