@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.acceleration import with_rates
-from latticebench.diagnosis.acting.scene import Course
 from latticebench.diagnosis.fitting import Fitted, fit
 from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.past import known, past_of, with_unread
+from latticebench.diagnosis.past import past_of, with_unread
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.reading import read_by
 from latticebench.methods.engine.dynamics import split_parts
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
 # The share of a recording that forecasts are judged on, and its rows, at most.
 HELD_OUT, MOST_ROWS = 0.3, 1500
 FEWEST_ROWS = 12
-# Readings before and after those times of which a curve is asked.
-NEAR = 6
 STEPS = 8
 
 
@@ -141,8 +138,7 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
         return [_lost(record.times[len(part.times) :], samples) for record, part, samples in
                 zip(other.records, early.records, other.data, strict=True)]  # fmt: skip
     model = again.model if not held_out else model
-    states = known(early, again.layout, again.model, again.followed.nodes)
-    return [_follow(model, again, other, number, states[number]) for number in range(len(other.records))]
+    return [_follow(model, again, other, number) for number in range(len(other.records))]
 
 
 def unforeseen(model: Model, problem: Problem) -> float:
@@ -193,17 +189,16 @@ def _lost(t: ndarray, samples: Samples) -> Prediction:
     return Prediction(t, seen, np.full_like(seen, np.inf), float("inf"))
 
 
-def _follow(
-    model: Model, again: Fitted, problem: Problem, number: int, early: Float[ndarray, "time state"]
-) -> Prediction:
-    """Return the forecast of the rest of one recording from where the early fit ends, with its states until then."""
+def _follow(model: Model, again: Fitted, problem: Problem, number: int) -> Prediction:
+    """Return the forecast of the rest of one recording from where the early fit ends."""
     record, samples = problem.records[number], problem.data[number]
     rows, nodes = again.layout.rows[number], again.followed.nodes[number]
     cut = int(np.max(rows)) + 1
     late = record.times[cut : cut + MOST_ROWS]
-    past = _Past(record.times[:cut], early[:cut], problem)
-    fed = any(one.fed for one in model.effects)
-    model = model.with_past((past,) * len(problem.records))
+    # A piece that is shorter than others has its last row again and again.
+    last = again.layout.valid[number][-1]
+    past = _Past(record.times[rows[-1][last]], nodes[-1][last], problem)
+    model = model.with_past((past,))
     assembled = model.assembled(problem.plain, problem.chain, number)
     state, found = nodes[-1, -1], []
     times = np.concatenate([[record.times[cut - 1]], late])
@@ -213,11 +208,7 @@ def _follow(
         for begin, end in itertools.pairwise(times):
             one = replace(stretches, begin=np.array([begin]), end=np.array([end]))
             substeps = np.full(1, np.ceil(dense * max(1.0, (end - begin) / problem.step)), dtype=int)
-            later = one.run(assembled.coefficients, state[None], substeps, problem.splines[number])[0]
-            if fed:
-                past.guess(float(end), later)
-                later = one.run(assembled.coefficients, state[None], substeps, problem.splines[number])[0]
-            state = later
+            state = one.run(assembled.coefficients, state[None], substeps, problem.splines[number])[0]
             found.append(state)
             past.learn(float(end), state)
         whole = problem.plain.whole(np.stack(found), record.stretches.driven(late, problem.splines[number]))
@@ -237,22 +228,17 @@ class _Past:
     def __init__(self, times: ndarray, nodes: ndarray, problem: Problem) -> None:
         self.times, self.nodes, self.problem = list(times), list(nodes), problem
 
-    def guess(self, t: float, state: ndarray) -> None:
-        """Add a state that will be learned better."""
-        self.times.append(t)
-        self.nodes.append(state[: self.problem.plain.read])
-
     def learn(self, t: float, state: ndarray) -> None:
-        """Add a state, or put the right one in the place of a guess."""
-        if self.times[-1] == t:
-            self.nodes[-1] = state[: self.problem.plain.read]
-        else:
-            self.guess(t, state)
+        """Add a state."""
+        self.times.append(t)
+        self.nodes.append(state)
 
     def __call__(self, t: ndarray) -> ndarray:
         """Return u at times (B,) that have been: (parts, B, N)."""
         times = np.array(self.times)
-        first = max(0, int(np.searchsorted(times, np.min(t))) - NEAR)
-        last = int(np.searchsorted(times, np.max(t))) + NEAR
-        field = self.problem.plain.whole(np.stack(self.nodes[first:last]), None)[:, 0]
-        return Course.of(times[first:last], field)(t)
+        first = max(0, int(np.searchsorted(times, np.min(t))) - 4)
+        field = self.problem.plain.whole(np.stack(self.nodes[first:]), None)[:, 0]
+        from scipy.interpolate import CubicSpline
+
+        curve = CubicSpline(times[first:], field)
+        return np.moveaxis(np.asarray(curve(np.clip(t, times[first], times[-1]))), 0, 1)

@@ -95,6 +95,10 @@ class Model:
         """Whether there is something with a frequency, a time or a delay of its own in it, wandering zeros apart."""
         return any(one.timed and one.wandering() is None for one in self.effects)
 
+    def hanging(self, chain: Chain) -> list[Placed]:
+        """Return the effects of which a part is not read, but has a state of its own."""
+        return [one for one in self.effects if one.resonator(chain) is not None]
+
     @property
     def driven(self) -> bool:
         """Whether there is something with a frequency of its own in it."""

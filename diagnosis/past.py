@@ -1,8 +1,13 @@
-"""What feeds a motion with its own past: the field at earlier times is the model's own, not what was read.
+"""What a motion has to do with its past: what it is fed with, and where what is not read may be.
+
+What feeds a motion with its past, the field at earlier times, is the model's own, not what was read.
 
 A term that is fed with readings guides the motion to them, whatever the equation lacks, as an observer does
 (Luenberger, IEEE Trans. Autom. Control 16, 596 (1971)). The past of a fit is therefore the motion that an earlier fit
 has found, until both are the same.
+
+What hangs beside a site and is not read has a state of its own. A fit begins with where it would be if it was at rest
+as the recording began, or with where an earlier fit has found it.
 """
 
 from __future__ import annotations
@@ -12,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from latticebench.diagnosis.acting import Chain, Placed
+from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.acting.scene import Course
 from latticebench.diagnosis.fitting import Fitted, fit
 from latticebench.diagnosis.horizon import Layout
@@ -30,70 +35,54 @@ if TYPE_CHECKING:
 ROUNDS, SETTLED = 4, 1.0
 
 
-def known(
+def past_of(
     problem: Problem, layout: Layout, model: Model, nodes: Sequence[Float[ndarray, "pieces m state"]]
-) -> list[Float[ndarray, "time state"]]:
-    """Return the states of each recording at all its times: along the pieces theirs, else what was read."""
+) -> tuple[Course, ...]:
+    """Return the field of each recording as a function of times: along the pieces their states, else what was read."""
     found = []
     for number, (rows, valid, states) in enumerate(zip(layout.rows, layout.valid, nodes, strict=True)):
         every = np.array(unread(model, layout, number, problem.nodes[number]))
         every[rows[valid]] = states[valid][:, : layout.plain.read]
-        found.append(every)
-    return found
-
-
-def past_of(
-    problem: Problem, layout: Layout, model: Model, nodes: Sequence[Float[ndarray, "pieces m state"]]
-) -> tuple[Course, ...]:
-    """Return the field of each recording as a function of times."""
-    found = []
-    for number, every in enumerate(known(problem, layout, model, nodes)):
-        record = layout.records[number]
-        driven = record.stretches.driven(record.times, layout.splines[number])
-        found.append(Course.of(record.times, layout.plain.whole(every, driven)[:, 0]))
+        found.append(_course(layout, number, every))
     return tuple(found)
-
-
-def _hanging(model: Model, chain: Chain) -> list[Placed]:
-    """Return the effects of which a part is not read."""
-    return [one for one in model.effects if one.resonator(chain) is not None]
-
-
-def beside(
-    model: Model, chain: Chain, past: Course, t: Float[ndarray, "*rows"], states: Float[ndarray, "*rows read"]
-) -> Float[ndarray, "*rows state"]:
-    """Return states of a recording with those of what is not read, as far as its past tells."""
-    return np.concatenate([states, *(one.unread(past, t) for one in _hanging(model, chain))], axis=-1)
-
-
-def with_unread_of(fitted: Fitted, number: int, states: Float[ndarray, "time read"]) -> Float[ndarray, "time state"]:
-    """Return states of a recording with those of what a fit knows and is not read."""
-    layout, nodes = fitted.layout, fitted.followed.nodes[number]
-    if nodes.shape[-1] == layout.plain.read:
-        return states
-    record = layout.records[number]
-    driven = record.stretches.driven(record.times, layout.splines[number])
-    past = Course.of(record.times, layout.plain.whole(states, driven)[:, 0])
-    found = beside(fitted.model, layout.chain, past, record.times, states)
-    rows, valid = layout.rows[number], layout.valid[number]
-    found[rows[valid], layout.plain.read :] = nodes[valid][:, layout.plain.read :]
-    return found
 
 
 def with_unread(
     problem: Problem, layout: Layout, model: Model, near: Sequence[Float[ndarray, "pieces m read"]]
 ) -> tuple[Float[ndarray, "pieces m state"], ...]:
-    """Return states with those of what is not read; as they are where they have these already."""
-    chain, read = layout.chain, layout.plain.read
-    hanging = _hanging(model, chain)
+    """Return states with those of what is not read, as far as the past tells; as they are where they have these."""
+    read, hanging = layout.plain.read, model.hanging(layout.chain)
     if near[0].shape[-1] == read + Resonator.size * len(hanging):
         return tuple(near)
     seen = tuple(one[..., :read] for one in near)
     if not hanging:
         return seen
     times = (record.times[rows] for record, rows in zip(layout.records, layout.rows, strict=True))
-    pasts = past_of(problem, layout, model, seen)
-    return tuple(beside(model, chain, *each) for each in zip(pasts, times, seen, strict=True))
+    return tuple(_with(hanging, *each) for each in zip(past_of(problem, layout, model, seen), times, seen, strict=True))
+
+
+def with_known(fitted: Fitted, number: int, states: Float[ndarray, "time read"]) -> Float[ndarray, "time state"]:
+    """Return states of a recording with those of what is not read, as a fit knows it where its pieces are."""
+    layout, nodes = fitted.layout, fitted.followed.nodes[number]
+    if not (hanging := fitted.model.hanging(layout.chain)):
+        return states
+    found = _with(hanging, _course(layout, number, states), layout.records[number].times, states)
+    rows, valid = layout.rows[number], layout.valid[number]
+    found[rows[valid], layout.plain.read :] = nodes[valid][:, layout.plain.read :]
+    return found
+
+
+def _with(
+    hanging: Sequence[Placed], past: Course, t: Float[ndarray, "*rows"], states: Float[ndarray, "*rows read"]
+) -> Float[ndarray, "*rows state"]:
+    return np.concatenate([states, *(one.unread(past, t) for one in hanging)], axis=-1)
+
+
+def _course(layout: Layout, number: int, states: Float[ndarray, "time read"]) -> Course:
+    """Return the field of one recording as a function of times, from its states."""
+    record = layout.records[number]
+    driven = record.stretches.driven(record.times, layout.splines[number])
+    return Course.of(record.times, layout.plain.whole(states, driven)[:, 0])
 
 
 def settled(

@@ -20,7 +20,7 @@ from latticebench.diagnosis.held import Held, freed
 from latticebench.diagnosis.inputs import in_words
 from latticebench.diagnosis.instrument import dead_sensors, describe, without
 from latticebench.diagnosis.modes import Mode
-from latticebench.diagnosis.past import with_unread_of
+from latticebench.diagnosis.past import with_known
 from latticebench.diagnosis.problem import Problem, derivative_share
 from latticebench.diagnosis.progress import Found, Horizon
 from latticebench.diagnosis.readout import unread
@@ -446,7 +446,7 @@ def _dynamics(problem: Problem, fitted: Fitted) -> float:
         dynamics, t = assembled.dynamics, record.times
         states = unread(fitted.model, fitted.layout, number, nodes)
         driven = record.stretches.driven(t, splines)
-        states = with_unread_of(fitted, number, states)
+        states = with_known(fitted, number, states)
         f = None if record.stretches.inputs is None else record.stretches.inputs(t)
         with np.errstate(all="ignore"):
             rate = dynamics.linear(assembled.coefficients, t, states, f, driven, derivatives=False)[0]

@@ -23,7 +23,7 @@ from latticebench.diagnosis.mirrored import images, mirrored
 from latticebench.diagnosis.model import Model
 from latticebench.diagnosis.moments import beside
 from latticebench.diagnosis.noise import Structure
-from latticebench.diagnosis.past import past_of, settled, with_unread, with_unread_of
+from latticebench.diagnosis.past import past_of, settled, with_known, with_unread
 from latticebench.diagnosis.pool import Pool
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.progress import Found, Horizon, Tried
@@ -216,7 +216,7 @@ class Search:
             nodes = np.array(unread(fitted.model, layout, number, self.problem.nodes[number]))
             old, valid = fitted.layout.rows[number], fitted.layout.valid[number]
             nodes[old[valid]] = fitted.followed.nodes[number][valid][:, : layout.plain.read]
-            near.append(with_unread_of(fitted, number, nodes)[rows])
+            near.append(with_known(fitted, number, nodes)[rows])
         ready = layout.with_substeps(fitted.model, near, self.problem.top)
         return self.refit(fitted.model, ready, near, fitted, steps, hope)
 

@@ -234,7 +234,10 @@ class Placed(ABC):
         return []
 
     def resonator(self, chain: Chain) -> Resonator | None:  # noqa: ARG002
-        """Return what swings beside a site, unread, in the place of forces; its numbers are all of the effect's."""
+        """Return what swings beside a site and is not read; its numbers are those of the effect.
+
+        A model has this in the place of forces, which then say what the effect would do to first order.
+        """
         return None
 
     def unread(self, past: Course, t: Float[ndarray, "pieces m"]) -> Float[ndarray, "pieces m numbers"]:

@@ -48,7 +48,10 @@ class Course:
         return np.moveaxis(np.asarray(self.curve(np.clip(t, self.begin, self.end))), 0, 1)
 
     def sampled(self, step: float) -> Float[ndarray, "parts grid sites"]:
-        """Return u from the first time on in steps, to the last time or just beyond it; kept for the last step."""
+        """Return u from the first time on in steps, to the last time or just beyond it.
+
+        Hundreds of candidates ask for it with one step.
+        """
         if step not in self._kept:
             self._kept.clear()
             self._kept[step] = self(self.begin + step * np.arange(int((self.end - self.begin) / step) + 2))
