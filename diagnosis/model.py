@@ -214,7 +214,7 @@ class _Sum:
             self.add(text, 0.0, {number: value}, weights, factor)
 
     def quicken(self, strength: float, order: int, number: int) -> None:
-        """Multiply all by (1 + strength)^order, as what goes so much quicker."""
+        """Multiply all forces by (1 + strength)^order, as what goes so much quicker; what is not read does not."""
         factor = 1 + strength
         for k, value in enumerate(self.coefficients):
             self.slopes[k] = self.slopes[k] * factor**order

@@ -287,8 +287,7 @@ class Tangent:
                 projected = vectors[:, held].T @ slopes[block]
                 numbers, freedom = vectors[:, held] @ (projected / values[held]), int(np.sum(held))
                 won = float(np.sum(projected**2 / values[held]))
-                hangs = one.resonator(self.fitted.chain) is not None
-                if (one.effect.takes and numbers[0] > 0) or (hangs and numbers[0] < 0):
+                if (one.effect.takes and numbers[0] > 0) or (one.positive and numbers[0] < 0):
                     won, numbers = 0.0, 0 * numbers
                 one = one.moved(one.numbers + numbers / unit[block])
             does[:, k], can[:, k] = part @ numbers, shared[:, block] @ numbers

@@ -16,7 +16,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from latticebench.diagnosis.acting import Placed
-from latticebench.diagnosis.acting.side_mass import SideMass
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.score import Tangent
 from latticebench.diagnosis.worth import pushed
@@ -73,7 +72,7 @@ def _at_a_site(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, 
         here = tuple(k for k, one in enumerate(effects) if one.site == site and not one.instrument)
         if len(here) < 2:
             continue
-        coarse = [one for one in problem.candidates if isinstance(one, SideMass) and one.site == site]
+        coarse = [one for one in problem.candidates if one.site == site and one.resonator(chain) is not None]
         hanging = [each for one in coarse for each in (one, *one.sharper())]
         without = tangent.in_place_of(here)
         scored = sorted(without.scored(hanging), key=lambda one: -one.won) if hanging else []

@@ -128,6 +128,7 @@ class Placed(ABC):
         general: whether it is looked for only in the place of another effect: as what that one is a special case of, or
             at declared terms. With a number for each bond it would take whatever is missing where there is hardly any
             noise.
+        positive: whether its first strength can only be positive.
         separated_by: the measurement that tells this way of acting from others; nothing where none is known.
     """
 
@@ -140,6 +141,7 @@ class Placed(ABC):
     local: ClassVar[bool] = False
     fed: ClassVar[bool] = False
     general: ClassVar[bool] = False
+    positive: ClassVar[bool] = False
     separated_by: ClassVar[str] = ""
 
     def __init_subclass__(cls, acts: str = "", how: str = "") -> None:
@@ -239,6 +241,10 @@ class Placed(ABC):
         A model has this in the place of forces, which then say what the effect would do to first order.
         """
         return None
+
+    def sharper(self) -> Iterator[Self]:
+        """Yield it with other numbers that are tried where its place is known."""
+        yield from ()
 
     def unread(self, past: Course, t: Float[ndarray, "pieces m"]) -> Float[ndarray, "pieces m numbers"]:
         """Return about where what is not read would be, if it was at rest as the recording began, and its rate."""

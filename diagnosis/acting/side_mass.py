@@ -52,6 +52,7 @@ class SideMass(AtOneSite, acts="side mass"):
     step: float
     shape: ClassVar[tuple[str, ...]] = ("omega", "gamma", "drag")
     timed: ClassVar[bool] = True
+    positive: ClassVar[bool] = True
     separated_by: ClassVar[str] = "a look at the site: what swings there is not in the recording"
 
     @classmethod
