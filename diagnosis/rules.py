@@ -84,7 +84,7 @@ REPELLING = 30.0
 DISPLACED = 1.0
 # A force with a frequency or a time of its own that pushes d times as hard as all else costs so many times ln(1 + d^2)
 # nats: Cauchy's prior for its size. Far above the chain's own frequencies a force must push so hard to do what a small
-# hum of a sensor does.
+# hum of a sensor does. A mass that is not read costs as much where it swings d times as far as its site.
 PUSHED = 1.0
 # Nats that a part of the noise which all sensors have in common must win beyond Schwarz' penalty (Ann. Stat. 6, 461,
 # 1978): without it a camera that shakes is a force on all sites, and with it a misfit could pass for noise.

@@ -108,9 +108,8 @@ def pushed(fitted: Fitted) -> float:
     Each costs ln(1 + d^2), with d its root mean square beside that of all terms that are no such forces, at the sites
     where it acts.
     """
-    effects = fitted.model.effects
-    # What hangs beside a site and is not read pushes as hard as it is pushed.
-    own = [one for one in effects if one.timed and not one.instrument and one.resonator(fitted.chain) is None]
+    effects, hanging = fitted.model.effects, fitted.model.hanging(fitted.chain)
+    own = [one for one in effects if one.timed and not one.instrument and one not in hanging]
     if not own:
         return 0.0
     plain = replace(fitted.model, effects=tuple(one for one in effects if one not in own))
@@ -124,9 +123,27 @@ def pushed(fitted: Fitted) -> float:
     return rules.PUSHED * found
 
 
+@functools.lru_cache(maxsize=64)
+def swung(fitted: Fitted) -> float:
+    """Return the nats that masses cost which are not read and swing farther than their sites.
+
+    Each costs ln(1 + d^2), with d the root mean square of its motion beside that of its site. Of a mass that hardly
+    weighs anything and may be anywhere, the force is any wave that dies out.
+    """
+    layout, model, found = fitted.layout, fitted.model, 0.0
+    if not model.hanging(fitted.chain):
+        return found
+    pairs = zip(fitted.followed.nodes, layout.valid, strict=True)
+    states = np.concatenate([nodes[valid] for nodes, valid in pairs])
+    for place, _, site, _ in model.assembled(layout.plain, layout.chain).dynamics.beside:
+        u = states[:, site]
+        found += float(np.log1p(np.sum(states[:, place] ** 2) / max(float(np.sum(u**2)), 1e-300)))
+    return rules.PUSHED * found
+
+
 def unlikely(fitted: Fitted) -> float:
-    """Return the nats that a model costs for how far its motion is from its zero, and how hard its forces push."""
-    return displaced(fitted) + pushed(fitted)
+    """Return the nats that a model costs for how far its motion goes, read or not, and how hard its forces push."""
+    return displaced(fitted) + pushed(fitted) + swung(fitted)
 
 
 def _rates(fitted: Fitted, model: Model) -> Float[ndarray, "rows channels"]:

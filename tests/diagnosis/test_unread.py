@@ -84,6 +84,16 @@ def test_a_candidate_knows_where_what_is_not_read_would_be():
 
 
 @pytest.mark.slow
+def test_a_mass_that_hardly_weighs_anything_does_not_swing_in_the_place_of_what_dies_out():
+    """On one pendulum, a mass of nothing that swings a hundred times as far does what a damping and a cube do."""
+    t = np.linspace(0, 60, 401)
+    y = solve_ivp(lambda _, y: [y[1], -3.6 * y[0] - 0.5 * y[0] ** 3 - 0.02 * y[1]], t[[0, -1]], [0.6, 0], t_eval=t).y[0]
+    samples = Samples(t, (y + 0.03 * np.random.default_rng(3).normal(size=t.size))[:, None], ends="free")
+    found = diagnose(library("spring", "u[n]"), 2, [samples], (*SOME, find("onsite-cubic")))
+    assert {one.name for one in found.findings} == {"damping", "onsite-cubic"}
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [6, 7])
 def test_a_mass_that_is_not_read_is_found_among_all_effects(seed):
     checked(diagnose(DECLARED, 2, [recording(seed=seed)[0]], CATALOGUE))
