@@ -27,16 +27,16 @@ def longest(problem: Problem) -> int:
     return min(whole, max(min(round(rules.BORDER * period), room), least(problem)))
 
 
-def longer(problem: Problem, length: int, settled: bool) -> list[int]:
+def longer(problem: Problem, length: int, sure: bool) -> list[int]:
     """Return the rows of the pieces after those of `length`, and fewer in case these cannot be followed.
 
     Args:
         problem: the recordings.
         length: rows of the pieces now.
-        settled: whether the last growth changed nothing: the next one is larger.
+        sure: whether the last growth changed nothing and the model follows the readings: the next one is larger.
     """
     most = longest(problem)
     if length >= most:
         return []
-    further = [length * many for many in ((rules.FASTER, rules.GROWTH) if settled else (rules.GROWTH,))]
+    further = [length * many for many in ((rules.FASTER, rules.GROWTH) if sure else (rules.GROWTH,))]
     return list(dict.fromkeys(one if one < rules.ALMOST * most else most for one in further))

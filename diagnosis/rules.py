@@ -63,7 +63,8 @@ EXCHANGED, OTHERWISE = 0.5, 0.9
 # Where the declared equation leaves less than so many times the noise of whole recordings, the search begins there:
 # what is missing is weak, and short horizons would only offer stand-ins.
 AT_ONCE = 1.5
-# Pieces grow so many times from one horizon to the next, and faster where that changed nothing; beyond this share of
+# Pieces grow so many times from one horizon to the next, and faster where that changed nothing and the model follows
+# the readings (`LOST`): what happens at a few times only is found while most pieces are without. Beyond this share of
 # the record they are the record.
 GROWTH, FASTER, ALMOST = 2, 4, 0.6
 # Periods of the longest pieces where the ends are unknown: the curves of the outer sites have numbers of their own in

@@ -33,7 +33,7 @@ from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.together import MOST_OF_IT, in_place
 from latticebench.diagnosis.walk_estimate import won_by_walking
-from latticebench.diagnosis.worth import Worth, fine, misfits, over, unlikely, wald
+from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, unlikely, wald
 
 Watcher = Callable[[str], None]
 
@@ -101,10 +101,11 @@ class Search:
             models = tuple((one.model.names, self.value(one) - base) for one in best)
             tried, misfit = self.tried.get(best[0].model.key, ()), misfits(self.problem, best[0])
             done = (*done, Horizon(best[0].longest, waves, models, tried, misfit))
-            settled = last is not None and last.models[0].model.key == best[0].model.key
+            stays = last is not None and last.models[0].model.key == best[0].model.key
+            sure = stays and beyond(self.problem, best[0]) < rules.LOST
             last = Found(before, tuple(best), done, whole)
             yield last
-            further = lengths.longer(self.problem, length, settled)
+            further = lengths.longer(self.problem, length, sure)
             followed = [one for one in (before, *best) if one.longest == best[0].longest]
             if not further and (finer := without_rounding(self.problem, followed, self.value)) is not None:
                 self.problem, further = finer, [lengths.longest(self.problem)]
@@ -143,7 +144,7 @@ class Search:
         asked = length if found is None else found.longest
         # Where there are gaps, pieces are shorter than what is asked for.
         while found is not None and asked < length:
-            (asked,) = lengths.longer(self.problem, asked, settled=False)
+            (asked,) = lengths.longer(self.problem, asked, sure=False)
             found = self.carry(found, self.layout(asked))
         return found
 

@@ -212,3 +212,23 @@ def test_a_heater_that_is_on_for_a_while_is_named_though_temperatures_relax():
     for name, true in (("at", at), ("width", width)):
         value, error = effects["local-kick"].values[name]
         assert value == pytest.approx(true, abs=4 * error)
+
+
+@pytest.mark.slow
+def test_taps_by_hand_are_each_named_though_one_effect_follows_all_pieces_between_them():
+    """Three pendula, of which the first is tapped three times: pieces must not grow past the taps at once."""
+    t, taps, width = np.arange(0, 40, 0.03), {6.0: 6.4, 17.3: -4.8, 29.0: 5.6}, 0.05
+
+    def rate(t, y):
+        u, v = np.split(y, 2)
+        beyond = np.concatenate([u[:1], u, u[-1:]])
+        force = sum(size * np.exp(-(((t - at) / width) ** 2) / 2) for at, size in taps.items())
+        return np.concatenate([v, 2 * np.diff(beyond, 2) - 15 * np.sin(u) - 0.1 * v + force * np.eye(3)[0]])
+
+    u = solve_ivp(rate, t[[0, -1]], [0.3, 0, 0.1, 0, 0, 0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.03).y[:3].T
+    data = Samples(t, u + 0.002 * np.random.default_rng(77).normal(size=u.shape), source="pendula", ends="free")
+    some = [one for one in CATALOGUE if one.name.endswith(("damping", "drag", "-kick", "-drive", "-hum"))]
+    found = diagnose(library("pendula", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])"), 2, [data], some)
+    assert (found.verdict, sorted(one.name for one in found.findings)) == ("explained", ["damping", *["local-kick"] * 3])
+    times = sorted(one.values["at"][0] for one in found.findings if one.name == "local-kick")
+    np.testing.assert_allclose(times, sorted(taps), atol=0.005)
