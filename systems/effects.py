@@ -286,6 +286,14 @@ CATALOGUE: tuple[Effect, ...] = (
         look_for="amplitudes that fall fastest where one site moves most", source=NAYFEH,
     ),
     Effect(
+        "local-drag", "abs(v[n])*v[n]", complex_field="", acts="one site", orders=(2,), takes=True,
+        look_for="large swings of one site that lose most, as of a cart with a sail", source=NAYFEH,
+    ),
+    Effect(
+        "local-friction", "sign(v[n])", complex_field="", acts="one site", orders=(2,), takes=True,
+        look_for="one site that turns with a jerk and stops first, as on a bearing that grates", source=NAYFEH,
+    ),
+    Effect(
         "local-cubic", "u[n]**3", complex_field="abs(u[n])**2*u[n]", acts="one site",
         look_for="a residual at one site that grows with the cube of its swings, as beside a magnet or of an impurity",
         source="Molina & Tsironis, Phys. Rev. B 47, 15330 (1993)",

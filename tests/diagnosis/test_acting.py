@@ -78,11 +78,14 @@ def problem_of(is_complex):
 
 
 def candidate(problem, way):
-    """A candidate of a way of acting with as many numbers as it has anywhere, in the middle of where it may be."""
+    """A candidate of a way of acting with as many numbers as it has anywhere, in the middle of where it may be.
+
+    Its strength may be of either sign.
+    """
     found = [one for one in problem.candidates if isinstance(one, WAYS[way]) and one.effect.acts == way]
     if way == "everywhere":
         return next(one for one in found if one.effect.name == "next-neighbour")
-    found = [one for one in found if not one.general] or found
+    found = [one for one in found if not (one.general or one.effect.takes)] or found
     most = max(len(one.numbers) for one in found)
     widest = [one for one in found if len(one.numbers) == most]
     # At the middle delay, an end of the past falls on a stage of the integrator, where its derivative jumps.

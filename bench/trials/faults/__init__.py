@@ -64,6 +64,8 @@ SECOND_ORDER = (
     "other: gyroscopic-bonds",
     "onsite-bilinear",
     "local-bilinear",
+    "local-drag",
+    "local-friction",
     "bilinear-coupling",
 )
 COMPLEX = ("other: phase-conjugation", "other: nonlocal-response")
