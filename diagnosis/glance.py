@@ -16,9 +16,11 @@ from scipy.special import betaincinv, gammaincinv
 from latticebench.diagnosis import rules
 from latticebench.diagnosis.acceleration import Acceleration
 from latticebench.diagnosis.acting import Force, InStep, Placed
+from latticebench.diagnosis.fitting import Fitted
 from latticebench.diagnosis.normal import by_pieces
 from latticebench.diagnosis.propagation import propagate
-from latticebench.diagnosis.score import Tangent, columns_of
+from latticebench.diagnosis.score import Scored, Tangent, columns_of
+from latticebench.diagnosis.walk_estimate import won_by_walking
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -167,3 +169,12 @@ def _dual(tangent: Tangent, number: int, readings: ndarray, rates: ndarray | Non
     dual[:, :-1] += np.einsum("pjqns,pjks->pjqnk", along.early, carried[:, 1:], optimize=True)
     dual[:, 1:] += np.einsum("pjqns,pjks->pjqnk", along.late, carried[:, 1:], optimize=True)
     return dual.reshape(-1, count)
+
+
+def restless(fitted: Fitted, candidates: Sequence[Placed]) -> list[Scored]:
+    """Return what zeros that wander would win, by what is left at their sensors."""
+    every = {site: one for one in candidates if (site := one.wandering()) is not None}
+    absent = {site: one for site, one in every.items() if site not in fitted.rows.walking}
+    followed = fitted.followed
+    gains = won_by_walking(fitted.noise, followed.left, followed.swing, fitted.rows, absent)
+    return [Scored(one, float(gain), 1, 2 * float(gain)) for one, gain in zip(absent.values(), gains, strict=True)]

@@ -8,6 +8,8 @@ from latticebench.diagnosis import rules
 from latticebench.diagnosis.border import MOST
 from latticebench.diagnosis.problem import Problem
 
+# On short horizons so many rows are looked at, or so many pieces' worth if that is more.
+ROWS, PIECES = 1200, 4
 # Derivatives of the states of one piece by the numbers of its border, at most: they grow as the square of its length.
 MOST_MOVES = 5e6
 
@@ -15,6 +17,11 @@ MOST_MOVES = 5e6
 def least(problem: Problem) -> int:
     """Return the fewest rows of a piece that say something."""
     return 2 * problem.chain.order // problem.chain.levels + 2
+
+
+def looked_at(length: int) -> int:
+    """Return the most rows that are looked at in pieces of so many."""
+    return max(ROWS, PIECES * length)
 
 
 def longest(problem: Problem) -> int:

@@ -99,11 +99,6 @@ class Model:
         """Return the effects of which a part is not read, but has a state of its own."""
         return [one for one in self.effects if one.resonator(chain) is not None]
 
-    @property
-    def driven(self) -> bool:
-        """Whether there is something with a frequency of its own in it."""
-        return any(one.frequency is not None for one in self.effects)
-
     def with_past(self, past: tuple[Factor, ...]) -> Model:
         """Return the same model, fed with another field at earlier times of each recording."""
         return replace(self, effects=tuple(one.with_past(past) for one in self.effects))

@@ -16,7 +16,7 @@ import numpy as np
 from latticebench.diagnosis import lengths, noise_parts, rules
 from latticebench.diagnosis.acting import Placed
 from latticebench.diagnosis.fitting import Fitted
-from latticebench.diagnosis.glance import crowding, most_promising
+from latticebench.diagnosis.glance import crowding, most_promising, restless
 from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.inputs import finest, interpolations, likeliest
 from latticebench.diagnosis.mirrored import images, mirrored
@@ -32,13 +32,10 @@ from latticebench.diagnosis.regression import regressed, sustained
 from latticebench.diagnosis.rounding import without_rounding
 from latticebench.diagnosis.score import Scored, Tangent
 from latticebench.diagnosis.together import MOST_OF_IT, in_place
-from latticebench.diagnosis.walk_estimate import won_by_walking
-from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, unlikely, wald
+from latticebench.diagnosis.worth import Worth, beyond, fine, misfits, over, surprises, unlikely, wald
 
 Watcher = Callable[[str], None]
 
-# On short horizons so many rows are looked at, or so many pieces' worth if that is more.
-ROWS, PIECES = 1200, 4
 # Errors of the integrator become smaller where what is left does by this factor.
 FINER = 4.0
 # From one fit to the next dry friction acts like a viscous one below a speed so many times as low, down to this share
@@ -58,7 +55,7 @@ class Search:
     def __init__(self, problem: Problem, watcher: Watcher) -> None:
         self.problem, self.say = problem, watcher
         self.structure = Structure()
-        self.small, self.memory = fine(problem), 0.0
+        self.small, self.memory, self.everywhere = fine(problem), 0.0, max(len(one.t) for one in problem.data)
         self.tried: dict[tuple[str, ...], tuple[Tried, ...]] = {}
         self.open: tuple[Placed, ...] = problem.candidates
         self.lengths: list[int] = []
@@ -110,12 +107,27 @@ class Search:
             if not further and (finer := without_rounding(self.problem, followed, self.value)) is not None:
                 self.problem, further = finer, [lengths.longest(self.problem)]
                 self.say("taking away what rounding adds to the readings")
-            each = ((self._carried(last, one), one) for one in further)
-            here = [] if late else [before, *best]
-            carried, length = next((pair for pair in each if pair[0]), (here, length))
-            stuck = bool(carried) and carried is here
+            carried, length = self._ahead(last, further, length)
+            stuck = not carried and not late
             if stuck:
+                carried = [before, *best]
                 self.say("no model can be followed further: looking for what acts at times of its own, too")
+
+    def _ahead(self, last: Found, further: Sequence[int], length: int) -> tuple[list[Fitted], int]:
+        """Return the models on the first of longer horizons where they can be followed, none if there is none.
+
+        Where they follow what was looked at, but no more than that, all is looked at on this horizon first.
+        """
+        for longer in further:
+            before = self.problem
+            if carried := self._carried(last, longer):
+                if length < self.everywhere and surprises(before, last.models[0], carried[1:]):
+                    after, self.problem, self.everywhere = self.problem, before, length
+                    if again := self._carried(last, length):
+                        return again, length
+                    self.problem = after
+                return carried, longer
+        return [], length
 
     def _at_once(self, first: list[Fitted]) -> list[Fitted]:
         """Return the first fits on the longest pieces if the declared equation alone nearly follows these.
@@ -136,8 +148,7 @@ class Search:
         ratio = over(self.problem, found)
         if not np.any(np.isfinite(ratio)) or np.sqrt(np.nanmean(ratio**2)) > rules.AT_ONCE:
             return []
-        rivals = [one for one in first if one.model.effects]
-        return self._laid([found, *rivals], found, whole)
+        return self._laid([found, *(one for one in first if one.model.effects)], found, whole)
 
     def _led(self, found: Fitted | None, length: int) -> Fitted | None:
         """Return the fit of a model on pieces of a length, by way of all between; None where the way ends before."""
@@ -164,15 +175,14 @@ class Search:
         return self.refit(model, layout.with_substeps(model, near, self.problem.top), near, None, steps)
 
     def layout(self, length: int, problem: Problem | None = None) -> Layout:
-        """Return pieces of a length: of all rows on long horizons, of some on short ones."""
-        most = None if length >= lengths.longest(self.problem) else max(ROWS, PIECES * length)
+        """Return pieces of a length: of all rows on long horizons, of some on short ones, unless asked for."""
+        most = None if length >= min(self.everywhere, lengths.longest(self.problem)) else lengths.looked_at(length)
         return Layout.of(problem or self.problem, length, most, self.small, self.memory)
 
     def _first(self, length: int) -> list[Fitted]:
         """Return the declared equation, and the rivals that begin the search."""
         problem = self.problem
-        layout = self.layout(length)
-        start = self._declared
+        layout, start = self.layout(length), self._declared
         still = replace(start, coefficients=(0.0,) * len(start.coefficients))
         fits: list[Fitted] = []
         at_once = [(start.with_effect(one), problem) for one in problem.candidates if one.from_the_start]
@@ -322,8 +332,8 @@ class Search:
         if len(model.effects) < rules.MOST_EFFECTS:
             timed = ahead == np.inf or not model.effects
             start, likely = self._likely(fitted, timed)
-            # A leader's force may swing as a single site would itself. Then little speaks for the true force alone.
-            bare = not model.effects and self.problem.chain.sites == 1 and pool.leading()[0].model.driven
+            # What leads may swing as a single site would itself. Then little speaks for the true force alone.
+            bare = not model.effects and self.problem.chain.sites == 1 and pool.leading()[0].model.may_stand_in
             for one in likely[: rules.TRIED]:
                 gain = rules.UNDERSTATED * one.gain / fitted.dispersion
                 force = bare and one.placed.frequency is not None
@@ -371,7 +381,7 @@ class Search:
         for number, placed in enumerate(effects):
             found = [one for one in self.standing_in(fitted, number) if self._rather(one, placed)]
             every += [((number,), one.placed) for one in found[:2]]
-        for numbers, one in (*every, *in_place(self.problem, self.tangent(fitted))):
+        for numbers, one in (*every, *in_place(self.problem, self.tangent(fitted), self.open)):
             model = functools.reduce(Model.without, sorted(numbers, reverse=True), fitted.model).with_effect(one)
             if model not in pool:
                 own = Worth(self.problem, fitted)
@@ -395,14 +405,6 @@ class Search:
     def without(self, fitted: Fitted, number: int, hope: float = np.inf) -> Fitted | None:
         """Return the fit without one effect; None where it comes to no cost below `hope`."""
         return self.refit(fitted.model.without(number), fitted.layout, fitted.followed.nodes, fitted, CHANGED, hope)
-
-    def restless(self, fitted: Fitted) -> list[Scored]:
-        """Return what zeros that wander would win, by what is left at their sensors."""
-        every = {site: one for one in self.open if (site := one.wandering()) is not None}
-        absent = {site: one for site, one in every.items() if site not in fitted.rows.walking}
-        followed = fitted.followed
-        gains = won_by_walking(fitted.noise, followed.left, followed.swing, fitted.rows, absent)
-        return [Scored(one, float(gain), 1, 2 * float(gain)) for one, gain in zip(absent.values(), gains, strict=True)]
 
     def with_effect(self, fitted: Fitted, placed: Placed) -> Fitted | None:
         """Return the fit with one effect more, from its score's numbers or, where these lead astray, from a tenth."""
@@ -451,7 +453,7 @@ class Search:
         Their gain is by how many nats they would do better.
         """
         placed = fitted.model.effects[number]
-        if not placed.strength or placed.timed:
+        if not placed.strength or (placed.timed and not placed.fed):
             return []
         present = {one.place for one in fitted.model.effects}
         absent = [one for one in self.open if one.place not in present and not one.timed]
@@ -471,18 +473,18 @@ class Search:
 
     def screened(self, fitted: Fitted, *, timed: bool = True) -> list[Scored]:
         """Return the candidates whose score is above their price, the best first."""
-        present = {one.place for one in fitted.model.effects if not one.timed}
-        absent = [one for one in self.open if one.place not in present and not (one.timed or one.general)]
+        hanging = fitted.model.hanging(fitted.chain)
+        present = {one.place for one in fitted.model.effects if not one.timed or one in hanging}
+        every = [one for one in self.open if one.place not in present and not one.general]
+        absent = [one for one in every if not one.timed]
         tangent, own = self.tangent(fitted), Worth(self.problem, fitted)
         if timed:
             past = past_of(self.problem, fitted.layout, fitted.model, fitted.followed.nodes)
-            courses = [
-                one.with_past(past) for one in self.open if one.timed and not one.general and one.wandering() is None
-            ]
+            courses = [one.with_past(past) for one in every if one.timed and one.wandering() is None]
             absent += most_promising(tangent, courses, self.problem.price_of, lambda one: one.effect.name)
         best: dict[tuple[object, ...], tuple[float, Scored]] = {}
         tried: dict[str, Tried] = {}
-        for one in (*tangent.scored(absent), *(self.restless(fitted) if timed else ())):
+        for one in (*tangent.scored(absent), *(restless(fitted, self.open) if timed else ())):
             name = one.placed.effect.name
             price = self.problem.price(name, one.freedom)
             if one.placed.frequency is not None and one.gain > price:

@@ -11,7 +11,7 @@ nearly one frequency, and as forces of that frequency.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -29,14 +29,14 @@ SOME_OF_IT, BEST = 0.5, 3
 HARD = 1.0
 
 
-def in_place(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ...], Placed]]:
+def in_place(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Iterator[tuple[tuple[int, ...], Placed]]:
     """Yield the numbers of effects of a model that swing together, with the candidate that does most of what they do.
 
     These are any two, and any one where forces push harder than all else. Frequencies are one where they differ by less
     than half of what the longest recording resolves. Besides, each may have a more general case (`Placed.general`), and
-    what hangs beside a site may be in the place of several effects there.
+    what hangs beside a site may be in the place of several effects there, where it is among the candidates `open_`.
     """
-    yield from _at_a_site(problem, tangent)
+    yield from _at_a_site(problem, tangent, open_)
     effects = tangent.fitted.model.effects
     swinging = [k for k, one in enumerate(effects) if one.frequency is not None]
     for k in swinging:
@@ -65,14 +65,14 @@ def in_place(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ..
             yield some, best.placed
 
 
-def _at_a_site(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ...], Placed]]:
+def _at_a_site(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Iterator[tuple[tuple[int, ...], Placed]]:
     """Yield the numbers of all effects of a model at a site, where there are several, with what may hang there."""
     effects, chain = tangent.fitted.model.effects, problem.chain
     for site in range(chain.sites):
         here = tuple(k for k, one in enumerate(effects) if one.site == site and not one.instrument)
         if len(here) < 2:
             continue
-        coarse = [one for one in problem.candidates if one.site == site and one.resonator(chain) is not None]
+        coarse = [one for one in open_ if one.site == site and one.resonator(chain) is not None]
         hanging = [each for one in coarse for each in (one, *one.sharper())]
         without = tangent.in_place_of(here)
         scored = sorted(without.scored(hanging), key=lambda one: -one.won) if hanging else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -59,6 +60,13 @@ def lost(problem: Problem, fitted: Fitted) -> bool:
     of_u = float(np.sqrt(np.nanmean(fitted.rms[: problem.chain.sites] ** 2)))
     large = beyond(problem, fitted) > rules.LOST and of_u > rules.FOLLOWED * problem.height
     return large and fitted.has_lines()
+
+
+def surprises(problem: Problem, fitted: Fitted, ahead: Sequence[Fitted]) -> bool:
+    """Return whether a model follows what was looked at, but is not among those that follow more on longer pieces."""
+    more = fitted.layout.readings() < ahead[0].layout.readings()
+    same = (one for one in ahead if one.model.key == fitted.model.key)
+    return more and beyond(problem, fitted) < rules.LOST <= min((beyond(problem, one) for one in same), default=np.inf)
 
 
 def misfits(problem: Problem, fitted: Fitted, *, anywhere: bool = False) -> bool:
@@ -135,9 +143,10 @@ def swung(fitted: Fitted) -> float:
         return found
     pairs = zip(fitted.followed.nodes, layout.valid, strict=True)
     states = np.concatenate([nodes[valid] for nodes, valid in pairs])
-    for place, _, site, _ in model.assembled(layout.plain, layout.chain).dynamics.beside:
-        u = states[:, site]
-        found += float(np.log1p(np.sum(states[:, place] ** 2) / max(float(np.sum(u**2)), 1e-300)))
+    dynamics = model.assembled(layout.plain, layout.chain).dynamics
+    for _, place, v in dynamics.beside:
+        u = states[:, v - dynamics.count]
+        found += float(np.log1p(np.sum(states[:, place] ** 2) / max(float(np.mean(u**2)) * len(u), 1e-300)))
     return rules.PUSHED * found
 
 
@@ -155,7 +164,9 @@ def _rates(fitted: Fitted, model: Model) -> Float[ndarray, "rows channels"]:
         states = fitted.followed.nodes[number].reshape(len(t), -1)
         inputs = None if record.stretches.inputs is None else record.stretches.inputs(t)
         driven = layout.driven(number, fitted.followed.splines[number])
-        rate = assembled.dynamics.linear(assembled.coefficients, t, states, inputs, driven, derivatives=False)[0]
+        # What hangs beside sites hands a force at one of them on to others.
+        dynamics = replace(assembled.dynamics, resonators=())
+        rate = dynamics.linear(assembled.coefficients, t, states, inputs, driven, derivatives=False)[0]
         rate = rate[:, : layout.plain.read].reshape(len(t), layout.plain.order, -1)
         rates.append(rate[layout.valid[number].ravel(), -1])
     return np.concatenate(rates)

@@ -26,6 +26,8 @@ HOW: dict[str, str] = {
     "step": "a declared term, or the formula, from one time on; term and time found",
     "delayed": "the formula of the field a delay earlier; delay found",
     "side mass": "a mass that is not read, on a spring and a dashpot at one site; site, frequency and damping found",
+    "support": "a support that sways, is not read, and carries all sites, which are read as it sees them; mass, "
+    "frequency and damping found",
     "long range": "sum over r >= 2 of (u_{n+r} + u_{n-r} - 2 u_n) / r^s; s found",
     "alternating": "the formula with the sign (-1)^k at site k",
     "one site": "the formula at one site only; site found",
@@ -314,6 +316,11 @@ CATALOGUE: tuple[Effect, ...] = (
         "side-mass", "u[n]", complex_field="", acts="side mass", orders=(2,),
         look_for="a line of one site's own, with another phase above it than below", source="Den Hartog, Mechanical "
         "Vibrations (1956), section 3.2",
+    ),
+    Effect(
+        "swaying-support", "u[n]", complex_field="", acts="support", orders=(2,),
+        look_for="a residual that is the same at all sites, and follows what they do together",
+        source="Bennett et al., Proc. R. Soc. A 458, 563 (2002)",
     ),
     Effect(
         "unequal-masses", "u[n]", acts="one equation",

@@ -11,7 +11,7 @@ import numpy as np
 from latticebench.diagnosis.acting.placed import DIGITS, AtOneSite, Force, Placed
 from latticebench.diagnosis.acting.scene import Chain, Course, Scene
 from latticebench.methods.engine.dynamics import Factor
-from latticebench.methods.engine.resonator import Resonator
+from latticebench.methods.engine.resonator import Absorber, Resonator, shaken
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class SideMass(AtOneSite, acts="side mass"):
 
     def resonator(self, chain: Chain) -> Resonator:
         """Return what swings at the site."""
-        return Resonator(chain.moving.index(self.here), *map(float, self.numbers))
+        return Absorber((chain.moving.index(self.here),), *map(float, self.numbers))
 
     def unread(self, past: Course, t: Float[ndarray, "*rows"]) -> Float[ndarray, "*rows 2"]:
         """Return about where the mass would be, if it was at rest as the recording began, and its velocity."""
@@ -117,23 +117,9 @@ class SideMass(AtOneSite, acts="side mass"):
         return [*found, Force("1", mass, {0: 1.0}, share, tuple(map(factor, self.past)))]
 
     def _followed(self, past: Course) -> tuple[ndarray, ndarray, ndarray]:
-        """Return times, y and y' of a mass that is at rest as the recording begins.
-
-        With lambda = -(gamma + drag) / 2 + i sqrt(omega^2 - (gamma + drag)^2 / 4) and z' = lambda z + u, of which the
-        solution is known where u is a straight line, y is the real part of a multiple of z.
-        """
-        from scipy.signal import lfilter
-
-        losses, step = self.gamma + self.drag, self.step / FINE
-        rate = complex(-losses / 2, np.sqrt(self.omega**2 - losses**2 / 4))
-        u, power = past.sampled(step)[0, :, self.here], rate * step
-        before, after = np.expm1(power) / power, (np.expm1(power) - power) / power**2
-        pushed = step * (before * u[:-1] + after * np.diff(u))
-        first = -u[:1] / rate
-        z = np.concatenate([first, lfilter([1.0], [1.0, -np.exp(power)], pushed, zi=np.exp(power) * first)[0]])
-        share = (self.gamma * rate + self.omega**2) / (1j * rate.imag)
-        grid = past.begin + step * np.arange(len(u))
-        return grid, np.real(share * z), np.real(share * (rate * z + u))
+        """Return times, y and y' of a mass that is at rest as the recording begins."""
+        u = past.sampled(step := self.step / FINE)[0, :, self.here]
+        return past.begin + step * np.arange(len(u)), *shaken(u, step, self.omega, self.gamma, self.drag)
 
     def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
         """Return what hangs where."""

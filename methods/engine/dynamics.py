@@ -196,19 +196,27 @@ class Dynamics:
             return rate
         later = np.empty_like(y)
         later[:, : self.read] = rate
-        for one, places in zip(self.resonators, self.beside, strict=True):
-            own, pushed = one.rates(y[:, places].T)
-            later[:, places[0]], later[:, places[1]] = y[:, places[1]], own
-            later[:, places[3]] += pushed
+        for (one, place, v), felt in zip(self.beside, self.felt(y.T, rate[:, self.count :].T), strict=True):
+            own, pushed = one.rates(felt)
+            later[:, place], later[:, place + 1] = y[:, place + 1], own
+            later[:, v] += pushed[:, None]
         return later
 
     @functools.cached_property
-    def beside(self) -> tuple[list[int], ...]:
-        """Where y, y', u and v of each resonator and its site are in a state."""
-        first = self.read
-        return tuple(
-            [first + 2 * k, first + 2 * k + 1, one.site, self.count + one.site] for k, one in enumerate(self.resonators)
-        )
+    def beside(self) -> tuple[tuple[Resonator, int, Int[ndarray, " sites"]], ...]:
+        """Each resonator with where its y is in a state, before its y', and where v of its sites is."""
+        places = range(self.read, self.size, Resonator.size)
+        return tuple((one, y, self.count + np.array(one.sites)) for one, y in zip(self.resonators, places, strict=True))
+
+    def felt(
+        self, state: Float[ndarray, "state *batch"], force: Float[ndarray, "moving *batch"]
+    ) -> list[Float[ndarray, "5 *batch"]]:
+        """Return y, y', and the sums of u, v and the terms' force over its sites, of each resonator."""
+        found = []
+        for _, place, v in self.beside:
+            sums = (one.sum(axis=0) for one in (state[v - self.count], state[v], force[v - self.count]))
+            found.append(np.stack([state[place], state[place + 1], *sums]))
+        return found
 
     def acting(self, coefficients: Float[ndarray, " terms"]) -> tuple[Dynamics, Float[ndarray, " terms"]]:
         """Return the equation of the terms whose coefficients are not zero, on the same sites, and these."""

@@ -89,7 +89,7 @@ class Stretches:
         """Whether both can be integrated as one: they follow one equation, without inputs or a drive."""
         one, two = self.dynamics, other.dynamics
         outside = (self.inputs, self.drive, other.inputs, other.drive)
-        same = ("terms", "order", "is_complex", "sites", "ends", "least_reach", "rest", "factors")
+        same = ("terms", "order", "is_complex", "sites", "ends", "least_reach", "rest", "factors", "resonators")
         return (
             all(given is None for given in outside)
             and all(getattr(one, name) == getattr(two, name) for name in same)
@@ -317,7 +317,9 @@ class Stretches:
                 if slopes_z is not None:
                     at = None if basis is None else basis[stage]
                     self._vary_rate(slopes_z[stage], at_z, values, slopes, at, chosen, by_terms=by_terms)
-                    self._vary_unread(slopes_z[stage], at_z, at_y, by_terms=by_terms)
+                    if self.dynamics.resonators:
+                        force = np.tensordot(coefficients, values[0], 1)
+                        self._vary_unread(slopes_z[stage], at_z, at_y, force, by_terms=by_terms)
             y = y + h[:, None] * _combine(b, slopes_y)
             if z is not None:
                 z = z + h * _combine(b, slopes_z)
@@ -389,18 +391,23 @@ class Stretches:
             own = columns - extra - unread - terms
             target[own : own + terms, -1] += np.transpose(values, (1, 0, 3, 2))
 
-    def _vary_unread(self, out: ndarray, z: Any, y: ndarray, *, by_terms: bool) -> None:
-        """Write d/dt of the resonators' derivatives, and add what they do to those of their sites."""
+    def _vary_unread(self, out: ndarray, z: Any, y: ndarray, force: ndarray, *, by_terms: bool) -> None:
+        """Write d/dt of the resonators' derivatives, and add what they do to those of their sites.
+
+        Their states are y, and the terms push with `force` (B, M).
+        """
         dynamics = self.dynamics
         first = len(z) - self._driving - sum(one.numbers for one in dynamics.resonators)
-        for one, places in zip(dynamics.resonators, dynamics.beside, strict=True):
-            own, pushed = np.tensordot(one.slopes, z[:, places], (1, 1))
-            out[:, places[0]], out[:, places[1]] = z[:, places[1]], own
-            out[:, places[3]] += pushed
+        varied = dynamics.felt(np.swapaxes(z, 0, 1), np.swapaxes(out[:, dynamics.count : dynamics.read], 0, 1))
+        felt = dynamics.felt(y.T, force.T)
+        for (one, place, v), change, own in zip(dynamics.beside, varied, felt, strict=True):
+            swing, pushed = np.tensordot(one.slopes, change, 1)
+            out[:, place], out[:, place + 1] = z[:, place + 1], swing
+            out[:, v] += pushed[:, None]
             if by_terms:
-                for number, (own, pushed) in enumerate(one.by_numbers(y[:, places].T), first):
-                    out[number, places[1]] += own
-                    out[number, places[3]] += pushed
+                for number, (swing, pushed) in enumerate(one.by_numbers(own), first):
+                    out[number, place + 1] += swing
+                    out[number, v] += pushed
                 first += one.numbers
 
     def _jacobian(self, slopes: dict[tuple[int, Slot], ndarray], batch: int) -> Float[ndarray, "batch rate state"]:

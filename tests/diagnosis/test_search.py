@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from latticebench import systems
 from latticebench.bench.trials.laboratory.making import make_recording
 from latticebench.bench.trials.trial import Trial
-from latticebench.diagnosis import pool, rules
+from latticebench.diagnosis import pool, rules, worth
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
 from latticebench.diagnosis.search import Search
@@ -233,3 +233,29 @@ def test_taps_by_hand_are_each_named_though_one_effect_follows_all_pieces_betwee
     assert (found.verdict, names) == ("explained", ["damping", *["local-kick"] * 3])
     times = sorted(one.values["at"][0] for one in found.findings if one.name == "local-kick")
     np.testing.assert_allclose(times, sorted(taps), atol=0.005)
+
+
+@pytest.mark.parametrize(("over", "lengths"), [(1.2, [200]), (5.0, [200, 100]), (None, [200, 100])])
+def test_a_model_that_does_not_follow_what_it_has_not_seen_is_shown_it_on_the_same_horizon(
+    over, lengths, driven, monkeypatch
+):
+    """It leaves `over` times the noise of all readings on longer pieces, or cannot be followed there."""
+
+    def fit(key, over, readings):
+        return SimpleNamespace(
+            over=over, model=SimpleNamespace(key=key), layout=SimpleNamespace(readings=lambda: readings)
+        )
+
+    def carried(_, last, length):
+        asked.append(length)
+        plain = fit((), 9.0, 800)
+        return [plain, *([] if over is None else [fit(("damping",), over, 800)]), plain]
+
+    monkeypatch.setattr(worth, "beyond", lambda _, one: one.over)
+    monkeypatch.setattr(Search, "_carried", carried)
+    search, asked = Search(Problem.of(SPRING, 2, [driven], CATALOGUE), lambda _: None), []
+    last = SimpleNamespace(models=(fit(("damping",), 1.1, 400),))
+    found, length = search._ahead(last, [200], 100)
+    assert (asked, length, bool(found)) == (lengths, lengths[-1], True)
+    # Once all has been seen, pieces grow.
+    assert search._ahead(last, [400], 200)[1] == 400

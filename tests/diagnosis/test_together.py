@@ -31,7 +31,7 @@ def test_a_force_that_pushes_harder_than_all_else_gives_way_to_the_hum_of_a_sens
     found = diagnose(DECLARED, 2, [data], [find("local-drive")])
     assert [(one.name, one.site) for one in found.findings] == [("local-drive", 1)]
     problem = Problem.of(DECLARED, 2, [data], [find("local-drive"), find("sensor-hum")])
-    ((numbers, one),) = in_place(problem, Tangent(found.after))
+    ((numbers, one),) = in_place(problem, Tangent(found.after), problem.candidates)
     assert numbers == (0,)
     assert (one.effect.name, one.site) == ("sensor-hum", 1)
     assert abs(one.frequency - 16.0) < 0.01
@@ -43,7 +43,7 @@ def test_a_force_at_one_site_and_one_at_all_give_way_to_the_hum_of_a_sensor():
     found = diagnose(DECLARED, 2, [data], forces)
     assert len(found.findings) == 2
     problem = Problem.of(DECLARED, 2, [data], [*forces, find("sensor-hum")])
-    ((numbers, one),) = in_place(problem, Tangent(found.after))
+    ((numbers, one),) = in_place(problem, Tangent(found.after), problem.candidates)
     assert numbers == (0, 1)
     assert (one.effect.name, one.site) == ("sensor-hum", 1)
     assert abs(one.frequency - OMEGA) < 0.01

@@ -1,4 +1,4 @@
-"""A mass that hangs beside a site and is not read."""
+"""What is not read: a mass that hangs beside a site, and a support that carries all sites."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from latticebench.diagnosis.acting.scene import Course
 from latticebench.diagnosis.acting.side_mass import SideMass
 from latticebench.diagnosis.cure import cure
+from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
 from latticebench.systems.effects import CATALOGUE, find
 from latticebench.systems.lattice import library
@@ -22,6 +23,8 @@ SOME = tuple(
     find(name)
     for name in ("damping", "defect", "unequal-masses", "local-damping", "local-drive", "memory", "side-mass")
 )
+# What stands in for a support on short pieces.
+ALIKE = tuple(find(name) for name in ("next-neighbour", "sensor-crosstalk", "drive", "swaying-support"))
 
 
 def recording(mass=0.3, omega=4.6, gamma=0.05, drag=0.0, start=(0.1, 0.3), seed=5):
@@ -111,3 +114,39 @@ def test_a_mass_that_swings_in_air_is_found_and_a_recording_without_any_mass_has
 def test_of_two_recordings_each_has_a_mass_that_begins_elsewhere():
     every = [recording()[0], replace(recording(start=(-0.2, 0.5), seed=8)[0], source="again")]
     checked(diagnose(DECLARED, 2, every, SOME))
+
+
+def carried(mass, omega, gamma):
+    """Three pendula beside one another, which nothing couples but a bar that all hang on, and where the bar is."""
+
+    def rate(_, y):
+        u, v, (place, speed) = y[:SITES], y[SITES:-2], y[-2:]
+        force = GRAVITY * np.sin(u)
+        sway = -(omega**2) * place - gamma * speed - mass * np.sum(force)
+        return np.r_[v, force - sway, speed, sway]
+
+    y = solve_ivp(rate, T[[0, -1]], [0.4, 0.05, -0.2, *np.zeros(5)], t_eval=T, rtol=1e-10, atol=1e-11).y.T
+    u = y[:, :SITES] + NOISE * np.random.default_rng(5).normal(size=(len(T), SITES))
+    return Samples(T, u, source="clocks", ends="free"), y[:, -2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mass", "omega", "gamma"), [(0.05, 1.34, 0.1), (0.3, 17.9, 1.0)])
+def test_a_support_that_sways_is_named_be_it_softer_or_stiffer_than_what_hangs_on_it(mass, omega, gamma):
+    samples, place = carried(mass, omega, gamma)
+    found = diagnose(library("clocks", "sin(u[n])"), 2, [samples], (*SOME, *ALIKE))
+    assert (found.verdict, [one.name for one in found.findings]) == ("explained", ["swaying-support"])
+    placed, errors = found.findings[0].placed, found.after.stderr[found.after.model.blocks[0]]
+    assert placed.numbers == pytest.approx([mass, omega, gamma], abs=4 * np.max(errors))
+    assert errors[0] < 0.05 * mass
+    states = found.after.followed.nodes[0][found.after.layout.valid[0]]
+    assert np.std(states[:, -2] - place) < 0.05 * np.std(place)
+    assert [len(some) for some in found.modes[1:]] == [SITES, SITES + 1]
+    assert "not read" in placed.sentences(found.after.chain)[0]
+
+
+def test_supports_are_looked_for_where_all_sites_have_an_equation():
+    samples, _ = carried(0.05, 1.34, 0.1)
+    for ends, there in (("free", True), ("unknown", False)):
+        problem = Problem.of(DECLARED, 2, [replace(samples, ends=ends)], CATALOGUE)
+        assert any(one.effect.name == "swaying-support" for one in problem.candidates) == there

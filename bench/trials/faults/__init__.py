@@ -119,6 +119,7 @@ CATALOGUED = {
     "known-input": Fault(unseen.known_input),
     "memory": Fault(unseen.memory),
     "side-mass": Fault(unseen.side_mass, "second order", real=True),
+    "swaying-support": Fault(unseen.swaying_support, "second order", real=True),
 }
 BLIND = {
     **_pushing(pushes.FIRST_BLIND),

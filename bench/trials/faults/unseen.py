@@ -51,6 +51,24 @@ def swaying_mount(setting: Setting, amount: complex) -> Fields:
     return _with_resonators(setting, amount, hung, float(setting.drawn.about["sway"]))
 
 
+def swaying_support(setting: Setting, amount: complex) -> Fields:
+    """Let a support sway that carries all sites, which are read as it sees them.
+
+    The amount is the mass of a site in units of the support's.
+    """
+    chain, own, mass = setting.chain, float(setting.drawn.about["sway"]), float(np.real(amount))
+    rate, sites = chain.right_hand_side, chain.parts * chain.sites
+
+    def carried(t: float, y: ndarray) -> ndarray:
+        change = rate(t, y[:-2])
+        sway = -(own**2) * y[-2] - mass * np.sum(change[-sites:])
+        change[-sites:] -= sway
+        return np.concatenate([change, [y[-1], sway]])
+
+    start = np.concatenate([setting.start, [0.0, 0.0]])
+    return chain.unpack(integrated(carried, start, setting.times)[:-2])
+
+
 def inner_resonators(setting: Setting, amount: complex) -> Fields:
     """Let each site have a resonator inside, all of them alike."""
     return _with_resonators(setting, amount, np.eye(setting.chain.sites), float(setting.drawn.about["own"]))

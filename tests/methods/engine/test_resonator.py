@@ -1,4 +1,4 @@
-"""A mass beside a site of which nothing is read, held against SciPy's integrator and against finite differences."""
+"""A mass or a support of which nothing is read, held against SciPy's integrator and against finite differences."""
 
 from dataclasses import replace
 
@@ -8,12 +8,13 @@ from scipy.integrate import solve_ivp
 
 from latticebench.methods.engine.bsplines import BSplines
 from latticebench.methods.engine.dynamics import Dynamics
-from latticebench.methods.engine.resonator import Resonator
+from latticebench.methods.engine.resonator import Absorber, Support
 from latticebench.methods.engine.sensitivity import Stretches
 from latticebench.systems.terms import Term
 
 SITES, TIME, SUBSTEPS = 4, 0.3, np.array([4, 4, 4])
-HANGING = (Resonator(1, 0.3, 4.6, 0.2, 0.1), Resonator(3, 0.1, 6.0, 0.1, 0.4))
+CARRIES = Support((0, 1, 2, 3), 0.15, 3.0, 0.3)
+HANGING = (Absorber((1,), 0.3, 4.6, 0.2, 0.1), Absorber((3,), 0.1, 6.0, 0.1, 0.4), CARRIES)
 COEFFICIENTS = np.array([3.0, -20.0])
 START = 0.3 * np.random.default_rng(0).standard_normal((3, 2 * SITES + 2 * len(HANGING)))
 
@@ -27,11 +28,17 @@ def stretches(*hanging):
 def rate(_, y):
     """The equations of the chain and of what hangs on it, written out."""
     u, v, hidden = y[:SITES], y[SITES : 2 * SITES], y[2 * SITES :].reshape(-1, 2)
-    force = 3 * np.diff(np.r_[u[0], u, u[-1]], 2) - 20 * np.sin(u)
-    own = []
+    terms = 3 * np.diff(np.r_[u[0], u, u[-1]], 2) - 20 * np.sin(u)
+    force, own = terms.copy(), []
     for one, (place, speed) in zip(HANGING, hidden, strict=True):
-        pull = one.omega**2 * (place - u[one.site]) + one.gamma * (speed - v[one.site])
-        force[one.site] += one.mass * pull
+        if isinstance(one, Support):
+            sway = -(one.omega**2) * place - one.gamma * speed - one.mass * np.sum(terms)
+            force -= sway
+            own += [speed, sway]
+            continue
+        (site,) = one.sites
+        pull = one.omega**2 * (place - u[site]) + one.gamma * (speed - v[site])
+        force[site] += one.mass * pull
         own += [speed, -pull - one.drag * speed]
     return np.r_[v, force, own]
 
@@ -55,7 +62,7 @@ def test_derivatives_by_the_start_the_coefficients_and_the_numbers_of_what_hangs
     for k, change in enumerate(np.eye(len(COEFFICIENTS))):
         by = slope(lambda h, change=change: every.run(COEFFICIENTS + h * change, START, SUBSTEPS))
         np.testing.assert_allclose(found.by_coefficient[:, k], by, atol=1e-7)
-    names = [(k, name) for k in range(len(HANGING)) for name in ("mass", "omega", "gamma", "drag")]
+    names = [(k, name) for k, one in enumerate(HANGING) for name in ("mass", "omega", "gamma", "drag")[: one.numbers]]
     for number, (k, name) in enumerate(names, len(COEFFICIENTS)):
 
         def ends(h, k=k, name=name):
@@ -68,14 +75,14 @@ def test_derivatives_by_the_start_the_coefficients_and_the_numbers_of_what_hangs
 
 
 def test_without_losses_what_hangs_keeps_the_energy_and_going_back_in_time_mirrors_the_motion():
-    one = Resonator(2, 0.25, 5.0, 0.0, 0.0)
+    one = Absorber((2,), 0.25, 5.0, 0.0, 0.0)
     alone, y = stretches(one), START[:, : 2 * SITES + 2]
 
     def energy(y):
         u, v, place, speed = y[:, :SITES], y[:, SITES:-2], y[:, -2], y[:, -1]
         chain = v**2 / 2 - 20 * np.cos(u)
         bonds = 1.5 * np.sum(np.diff(u, axis=1) ** 2, axis=1)
-        return np.sum(chain, axis=1) + bonds + one.mass * (speed**2 + one.omega**2 * (place - u[:, one.site]) ** 2) / 2
+        return np.sum(chain, axis=1) + bonds + one.mass * (speed**2 + one.omega**2 * (place - u[:, 2]) ** 2) / 2
 
     end = alone.run(COEFFICIENTS, y, SUBSTEPS)
     np.testing.assert_allclose(energy(end), energy(y), rtol=1e-9)
@@ -83,10 +90,24 @@ def test_without_losses_what_hangs_keeps_the_energy_and_going_back_in_time_mirro
     np.testing.assert_allclose(alone.run(COEFFICIENTS, end * mirror, SUBSTEPS) * mirror, y, atol=1e-8)
 
 
+def test_without_losses_a_support_keeps_the_energy_that_sites_have_by_their_absolute_velocities():
+    """Seen from the bench, a site moves at v + y'; the support weighs as much as 1 / mass of them."""
+    one = Support((0, 1, 2, 3), 0.15, 3.0, 0.0)
+    alone, y = stretches(one), START[:, : 2 * SITES + 2]
+
+    def energy(y):
+        u, v, place, speed = y[:, :SITES], y[:, SITES:-2], y[:, -2], y[:, -1]
+        chain = (v + speed[:, None]) ** 2 / 2 - 20 * np.cos(u)
+        bonds = 1.5 * np.sum(np.diff(u, axis=1) ** 2, axis=1)
+        return np.sum(chain, axis=1) + bonds + (speed**2 + one.omega**2 * place**2) / one.mass / 2
+
+    np.testing.assert_allclose(energy(alone.run(COEFFICIENTS, y, SUBSTEPS)), energy(y), rtol=1e-8)
+
+
 def test_a_lattice_without_anything_beside_it_has_a_state_of_what_is_read():
     plain = stretches().dynamics
     assert plain.size == plain.read == 2 * SITES
-    assert stretches(*HANGING).dynamics.size == plain.size + 4
+    assert stretches(*HANGING).dynamics.size == plain.size + 6
     assert plain.sized([1.0, 2.0]).tolist() == pytest.approx([1.0] * SITES + [2.0] * SITES)
 
 
