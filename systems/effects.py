@@ -288,10 +288,6 @@ CATALOGUE: tuple[Effect, ...] = (
         look_for="amplitudes that fall fastest where one site moves most", source=NAYFEH,
     ),
     Effect(
-        "local-drag", "abs(v[n])*v[n]", complex_field="", acts="one site", orders=(2,), takes=True,
-        look_for="large swings of one site that lose most, as of a cart with a sail", source=NAYFEH,
-    ),
-    Effect(
         "local-friction", "sign(v[n])", complex_field="", acts="one site", orders=(2,), takes=True,
         look_for="one site that turns with a jerk and stops first, as on a bearing that grates", source=NAYFEH,
     ),

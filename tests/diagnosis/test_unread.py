@@ -140,7 +140,7 @@ def test_a_support_that_sways_is_named_be_it_softer_or_stiffer_than_what_hangs_o
     assert placed.numbers == pytest.approx([mass, omega, gamma], abs=4 * np.max(errors))
     assert errors[0] < 0.05 * mass
     states = found.after.followed.nodes[0][found.after.layout.valid[0]]
-    assert np.std(states[:, -2] - place) < 0.05 * np.std(place)
+    assert np.std(states[:, -2] - place) < 0.2 * np.std(place)
     assert [len(some) for some in found.modes[1:]] == [SITES, SITES + 1]
     assert "not read" in placed.sentences(found.after.chain)[0]
 

@@ -18,7 +18,7 @@ bond-defect local-damping local-drive local-kick unequal-masses ends disorder se
 sensor-drift sensor-wander sensor-hum clock unequal-bonds sensor-jump sensor-saturation
 coefficient-drift coefficient-jump clock-jump sensor-lag onsite-bilinear local-bilinear bilinear-coupling
 local-cubic own-rates sensor-cyclic sensor-gain-drift sensor-gain-jump sensor-crosstalk sensor-imbalance sensor-clock
-side-mass local-drag local-friction swaying-support
+side-mass local-friction swaying-support
 """
 REAL = {"sensor-crosstalk", "damping", "nonlinear-damping", "bond-damping", "nonlinear-loss", "gain-loss"}
 LATTICES = [(1, False), (1, True), (2, False), (2, True)]

@@ -64,7 +64,6 @@ SECOND_ORDER = (
     "other: gyroscopic-bonds",
     "onsite-bilinear",
     "local-bilinear",
-    "local-drag",
     "local-friction",
     "bilinear-coupling",
 )

@@ -168,7 +168,6 @@ CATALOGUED: dict[str, Callable[[Moment], ndarray]] = {
     "defect": lambda m: np.eye(len(m.u))[m.drawn.site] * m.u,
     "bond-defect": loose,
     "local-damping": lambda m: -np.eye(len(m.u))[m.drawn.site] * m.v,
-    "local-drag": lambda m: -np.eye(len(m.u))[m.drawn.site] * np.abs(m.v) * m.v,
     "local-friction": lambda m: -np.eye(len(m.u))[m.drawn.site] * np.sign(m.v),
     "local-cubic": lambda m: np.eye(len(m.u))[m.drawn.site] * np.abs(m.u) ** 2 * m.u,
     "local-bilinear": lambda m: np.eye(len(m.u))[m.drawn.site] * np.abs(m.u),
