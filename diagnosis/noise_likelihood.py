@@ -33,6 +33,9 @@ LIGHTEST = 1000.0
 # Correlations from one typical reading to the next. A stronger one than the largest may stand for any slow misfit of
 # the equation, which the equation should have to answer for; below the least, the noise is white.
 MOST_CORRELATED, LEAST_CORRELATED = 0.98, 1e-3
+# Nats to which the greatest likelihood is found; of less than so many readings, which hardly know the parts of their
+# noise, and look for it longest, those nats.
+EXACT, FEW, ROUGH = 1e-4, 400, 1e-3
 # The largest share that is white where the rest of the noise is slow: with all of it there would be no rest.
 MOST_WHITE = 0.999
 
@@ -126,9 +129,10 @@ class Residuals:
             bounds += [(0.0, MOST_WHITE)] * (groups * structure.white)
             bounds += [(LEAST_CORRELATED, MOST_CORRELATED)] * structure.common
             bounds += [(-MOST, MOST)] * (structure.shares(self.sensors) * structure.common)
+            nats = EXACT if len(self.value) >= FEW else ROUGH
             result = minimize(
                 self.cost, numbers, args=(structure,), jac=True, method="L-BFGS-B", bounds=bounds,
-                options={"ftol": 1e-4 / len(self.value), "gtol": 1e-5, "maxiter": 200},
+                options={"ftol": nats / len(self.value), "gtol": 1e-5, "maxiter": 200},
             )  # fmt: skip
             found, cost = self.unpacked(np.asarray(result.x), structure), float(result.fun)
         return found, -len(self.value) * (cost + float(np.log(self.unit)))
