@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from latticebench.diagnosis.acting.hanging import APART, FINE, UNTOLD, Hanging, frequencies
 from latticebench.diagnosis.acting.placed import DIGITS, AtOneSite, Force, Placed
 from latticebench.diagnosis.acting.scene import Chain, Course, Scene
 from latticebench.methods.engine.dynamics import Factor
@@ -20,39 +21,24 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-# Frequencies that are tried, from this share of the main one up to so many times the highest, each so many times the
-# last, with a dashpot that makes the resonance as wide as they are apart.
-LOWEST, HIGHEST, APART = 0.4, 1.6, 1.12
+# Frequencies are tried from this share of the main one up to so many times the highest.
+LOWEST, HIGHEST = 0.4, 1.6
 # Sharper ones about each of them: how far apart, and how many to either side.
 SHARP, ASIDE = 1.02, 3
-# Either loss may seem to be a gain by this share of the frequency: a recording may not tell them apart.
-UNTOLD = 0.1
-# Steps between two readings on which the motion of a site is taken for straight.
-FINE = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SideMass(AtOneSite, acts="side mass"):
+class SideMass(AtOneSite, Hanging, acts="side mass"):
     """A mass that hangs on one site by a spring and a dashpot, and is not read: the absorber of Frahm and Den Hartog.
 
     See `methods.engine.resonator` for the equations; the strength is its mass in units of the site's.
 
     Attributes:
-        omega: angular frequency of the mass on a site that is held, one over the unit of time.
-        gamma: of the dashpot, one over the unit of time.
-        drag: of the mass on its own, likewise.
-        past: how the sites of each recording move, as long as nothing hangs there: for the score.
-        step: a typical time between readings.
+        drag: of the mass on its own, one over the unit of time; the frequency is that on a site that is held.
     """
 
-    omega: float
-    gamma: float
     drag: float
-    past: tuple[Course, ...]
-    step: float
     shape: ClassVar[tuple[str, ...]] = ("omega", "gamma", "drag")
-    timed: ClassVar[bool] = True
-    positive: ClassVar[bool] = True
     separated_by: ClassVar[str] = "a look at the site: what swings there is not in the recording"
 
     @classmethod
@@ -60,8 +46,7 @@ class SideMass(AtOneSite, acts="side mass"):
         """Return each site, with frequencies about those of the motion."""
         if not scene.terms(effect) or not scene.main:
             return
-        lowest, highest = LOWEST * scene.main, HIGHEST * scene.top
-        for omega in lowest * APART ** np.arange(1 + int(np.log(highest / lowest) / np.log(APART))):
+        for omega in frequencies(LOWEST * scene.main, HIGHEST * scene.top):
             for here in scene.chain.moving:
                 yield cls(
                     effect=effect, here=here, omega=float(omega), gamma=float((APART - 1) * omega), drag=0.0,
@@ -78,21 +63,11 @@ class SideMass(AtOneSite, acts="side mass"):
         return ("mass beside the site's",)
 
     @property
-    def near(self) -> tuple[object, ...]:
-        """The place, with the frequency to one digit."""
-        return (*self.place, f"{self.omega:.1g}")
-
-    @property
     def possible(self) -> bool:
         """Whether there is a mass, and it swings and loses."""
         losses = self.gamma, self.drag
         swings = abs(sum(losses)) < self.omega
         return self.strength[0] >= 0 and swings and min(losses) > -UNTOLD * self.omega
-
-    def with_past(self, past: tuple[Factor, ...]) -> Self:
-        """Return it beside sites that move in another way; what is still being forecast tells nothing."""
-        courses = tuple(one for one in past if isinstance(one, Course))
-        return replace(self, past=courses or self.past)
 
     def resonator(self, chain: Chain) -> Resonator:
         """Return what swings at the site."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from latticebench.diagnosis.acting.hanging import APART, FINE, UNTOLD, Hanging, frequencies
 from latticebench.diagnosis.acting.placed import DIGITS, Force, Placed
 from latticebench.diagnosis.acting.scene import Chain, Course, Scene
 from latticebench.methods.engine.dynamics import Factor
@@ -15,40 +16,24 @@ from latticebench.methods.engine.resonator import Resonator, Support, shaken
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:
-    from typing import Self
-
     from jaxtyping import Float
     from numpy import ndarray
 
-# Frequencies that are tried, from this share of the main one up to so many times the highest, each so many times the
-# last, with losses that make the resonance as wide as they are apart: a stiff support yields without swinging.
-LOWEST, HIGHEST, APART = 0.2, 4.0, 1.12
-# Losses may seem to be gains by this share of the frequency: a recording may not tell them apart.
-UNTOLD = 0.1
-# Steps between two readings on which the motion is taken for straight.
-FINE = 4
+# Frequencies are tried from this share of the main one up to so many times the highest: a stiff support yields without
+# swinging.
+LOWEST, HIGHEST = 0.2, 4.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SwayingSupport(Placed, acts="support"):
+class SwayingSupport(Hanging, acts="support"):
     """A bar or a board that sways on a spring and a dashpot, and carries all sites: the case of Huygens' clocks.
 
     See `methods.engine.resonator` for the equations; the strength is the mass of a site in units of the support's.
 
-    Attributes:
-        omega: angular frequency of the support without what hangs on it, one over the unit of time.
-        gamma: of its dashpot, likewise.
-        past: how the sites of each recording move on a support that stands: for the score.
-        step: a typical time between readings.
+    The frequency is that of the support without what hangs on it.
     """
 
-    omega: float
-    gamma: float
-    past: tuple[Course, ...]
-    step: float
     shape: ClassVar[tuple[str, ...]] = ("omega", "gamma")
-    timed: ClassVar[bool] = True
-    positive: ClassVar[bool] = True
     separated_by: ClassVar[str] = "the same motion on a support that is held fast, or one that is read, too"
 
     @classmethod
@@ -57,8 +42,7 @@ class SwayingSupport(Placed, acts="support"):
         chain = scene.chain
         if not scene.terms(effect) or not scene.main or not len(chain.moving) == chain.sites > 1:
             return
-        lowest, highest = LOWEST * scene.main, HIGHEST * scene.top
-        for omega in lowest * APART ** np.arange(1 + int(np.log(highest / lowest) / np.log(APART))):
+        for omega in frequencies(LOWEST * scene.main, HIGHEST * scene.top):
             yield cls(
                 effect=effect, omega=float(omega), gamma=float((APART - 1) * omega), past=scene.past, step=scene.step,
                 strength=(0.0,),
@@ -69,19 +53,9 @@ class SwayingSupport(Placed, acts="support"):
         return ("site's mass beside the support's",)
 
     @property
-    def near(self) -> tuple[object, ...]:
-        """The place, with the frequency to one digit."""
-        return (*self.place, f"{self.omega:.1g}")
-
-    @property
     def possible(self) -> bool:
         """Whether there is a mass, and it swings and loses."""
         return self.strength[0] >= 0 and -UNTOLD * self.omega < self.gamma < self.omega
-
-    def with_past(self, past: tuple[Factor, ...]) -> Self:
-        """Return it with sites that move in another way; what is still being forecast tells nothing."""
-        courses = tuple(one for one in past if isinstance(one, Course))
-        return replace(self, past=courses or self.past)
 
     def resonator(self, chain: Chain) -> Resonator:
         """Return what swings with the sites."""

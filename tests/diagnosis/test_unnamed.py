@@ -157,13 +157,10 @@ def test_what_acts_at_one_site_or_bond_is_named_where_it_is(name, force):
 
 @pytest.mark.slow
 def test_what_misreads_in_time_beside_unknown_ends_is_fitted():
+    # A damping of a course in time does nearly the same: of half as much either may be said first.
     def read(u):
-        return u * (1 + 0.1 * np.sin(np.linspace(0, 9, len(u))))[:, None]
+        return u * (1 + 0.2 * np.sin(np.linspace(0, 9, len(u))))[:, None]
 
     found = diagnosed(chain(ends="unknown", sites=4, read=read), ("damping", "sensor-offset"))
     assert found.verdict in ("unexplained", "partly explained")
-    # A damping of a course in time does nearly what a gain common to all sensors does.
-    best = max(one.gain for one in found.left)
-    assert "a gain of its own course in time, common to all sensors" in [
-        one.name for one in found.left if one.gain > best - 1
-    ]
+    assert found.left[0].name == "a gain of its own course in time, common to all sensors"
