@@ -115,6 +115,10 @@ class Chain:
                 f"local-damping@{k}": lambda _, v, row=row: v * row  # type: ignore[misc]
                 for k, row in enumerate(np.eye(self.sites))
             },
+            **{
+                f"local-friction@{k}": lambda _, v, row=row: np.tanh(v / thin) * row  # type: ignore[misc]
+                for k, row in enumerate(np.eye(self.sites))
+            },
         }
 
     @functools.cached_property

@@ -3,14 +3,17 @@
 Parameters are named "coefficient" (of the catalogue's formula), "scale" (of a site's whole right-hand side beyond 1),
 "cos", "sin" and "omega" (of a drive, at all sites or at one, or of a sensor's hum), "offset_2", "gain_2", "curve_2",
 "lag_2" and "jump_2" (of the second sensor, which reads gain * u + offset + curve * u^2 of a time lag ago, and from the
-time "when" on jump more), "fade_2" (by how much its gain grows over the recording), "slow_2" (how much later it reads
-per time), "crosstalk" (how much of its neighbours each sensor reads), "curve" and "cubic" (one for all, the latter of
-u^3), "bond_2" (from the second site on), and "ramp of u[n]" (how fast that coefficient changes) and "step of u[n]" (by
-how much it does, at "when").
+time "when" on jump more), "change_2" (what its gain has more from "when" on), "fade_2" (by how much its gain grows over
+the recording), "slow_2" (how much later it reads per time), "sine_2", "cosine_2" and "per_reading" (of an error
+a sin(k u) + b (cos(k u) - 1) of it), "lost" (how much later all are read from "when" on), "crosstalk" (how much of its
+neighbours each sensor reads), "curve" and "cubic" (one for all, the latter of u^3), "bond_2" (from the second site on),
+"ramp of u[n]" (how fast that coefficient changes) and "step of u[n]" (by how much it does, at "when"), and those of
+`unread.NUMBERS`.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.bench.trials.laboratory.chains import Chain
+from latticebench.bench.trials.laboratory.unread import NUMBERS, SIDE, SUPPORT
 
 if TYPE_CHECKING:
     from numpy import ndarray
@@ -28,6 +32,8 @@ AT_ONE_SITE = ("defect", MASSES)
 # At one site or bond, too; put in where they are asked for.
 LOCAL_DRIVE, LOCAL_DAMPING, BOND = "local-drive", "local-damping", "bond-defect"
 LOCAL = (LOCAL_DRIVE, LOCAL_DAMPING, BOND)
+# A bearing that grates, a mass that hangs at one site, and a support that all hang on, likewise.
+RUB, SIDE_MASS, SWAYING = "local-friction", "side-mass", "swaying-support"
 # A curve that one sensor has alone; put in where it is asked for.
 OWN_CURVE = "own-sensor-curve"
 # A sensor that hums, likewise; as fast as to be read so many times in half a period at least.
@@ -36,6 +42,8 @@ HUM, PER_HALF = "sensor-hum", 1.25
 LAG, JUMP, LENS = "sensor-lag", "sensor-jump", "sensor-saturation"
 # Sensors that hear their neighbours, one whose gain drifts, and one with a clock of its own, likewise.
 CROSSTALK, FADING, OWN_CLOCK = "sensor-crosstalk", "sensor-gain-drift", "sensor-clock"
+# A sensor that changes its range, an encoder out of centre, and a camera that drops frames, likewise.
+RANGE, CYCLIC, DROPPED = "sensor-gain-jump", "sensor-cyclic", "clock-jump"
 # Declared coefficients that change, likewise.
 AGEING, SLIP = "coefficient-drift", "coefficient-jump"
 # Springs of which no two are alike, likewise.
@@ -49,8 +57,11 @@ COUPLED = ("quadratic-coupling", "nonlinear-coupling", "asymmetric-coupling")
 MOST_EFFECTS = 5
 # What has a meaning where there are several sites that move.
 OF_SEVERAL = (
-    GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM, LAG, JUMP, MAINS, CROSSTALK, FADING, OWN_CLOCK
+    GAIN, *AT_ONE_SITE, LOCAL_DRIVE, LOCAL_DAMPING, OWN_CURVE, HUM, LAG, JUMP, MAINS, CROSSTALK, FADING, OWN_CLOCK,
+    RUB, SWAYING, RANGE, CYCLIC,
 )  # fmt: skip
+# What is put in only where all sites have an equation.
+OF_KNOWN_ENDS = (CROSSTALK, SWAYING, DROPPED)
 # What is asked for instead of names.
 ANY, NONE = "any", "none"
 DECLARED = {"onsite-linear": "u[n]", "onsite-cubic": "u[n]**3"}
@@ -61,7 +72,7 @@ NAMES = (
 # How often each is drawn, where 1 is not given: what most recordings have.
 OFTEN = {OFFSET: 3.0, GAIN: 2.0, "damping": 3.0, "quadratic-drag": 1.5, "dry-friction": 1.5, "defect": 1.5}
 ASKED = (*NAMES, *LOCAL, BONDS, OWN_CURVE, HUM, LAG, JUMP, LENS, MAINS, CROSSTALK, FADING, OWN_CLOCK,
-         AGEING, SLIP, *CLASSIC)  # fmt: skip
+         RUB, SIDE_MASS, SWAYING, RANGE, CYCLIC, DROPPED, AGEING, SLIP, *CLASSIC)  # fmt: skip
 """Every effect that can be asked for."""
 HELD_OUT = (frozenset({GAIN, "dry-friction"}), frozenset({"defect", "onsite-quintic", "damping"}))
 """Combinations of effects that are never drawn, alone or with others, unless they are asked for."""
@@ -97,8 +108,11 @@ class Ingredient:
 
     def key(self, parameter: str) -> str:
         """Return the name of one of its parameters among all of a chain's, see `Chain.rate`."""
-        if self.name in (HUM, JUMP):
-            return f"{self.name.removeprefix('sensor-')}.{parameter.partition('_')[0]}@{self.site}"
+        own = {HUM: "hum", JUMP: "jump", RANGE: "change", CYCLIC: "cycle", SIDE_MASS: SIDE}.get(self.name)
+        if own is not None:
+            return f"{own}.{re.sub('_[0-9]+$', '', parameter)}@{self.site}"
+        if self.name in (SWAYING, DROPPED):
+            return f"{SUPPORT if self.name == SWAYING else 'frames'}.{parameter}"
         if self.name in (AGEING, SLIP):
             return parameter if parameter in self.direction else "step when"
         if self.name == BONDS:
@@ -107,7 +121,7 @@ class Ingredient:
             return f"drive.{parameter}" + ("" if self.site is None else f"@{self.site}")
         if self.name == "disorder":
             return f"defect@{int(parameter.partition('_')[2]) - 1}"
-        if self.name in (*AT_ONE_SITE, LOCAL_DAMPING, BOND):
+        if self.name in (*AT_ONE_SITE, LOCAL_DAMPING, RUB, BOND):
             return f"{self.name}@{self.site}"
         return self.name if parameter == "coefficient" else parameter
 
@@ -141,7 +155,7 @@ def sensible(chain: Chain, reach: int, names: Sequence[str] = NAMES) -> list[str
             continue
         if name in OF_SEVERAL and inner < 2:
             continue
-        if name == CROSSTALK and reach:
+        if name in OF_KNOWN_ENDS and reach:
             continue
         if name == BOND and not (chain.coupled and inner > 2):
             continue
@@ -166,14 +180,22 @@ def draw_ingredient(name: str, chain: Chain, reach: int, draw: np.random.Generat
     """
     inner = np.arange(reach, chain.sites - reach)
     site = int(draw.choice(inner[:-1] if name == BOND else inner))
-    sign = -1.0 if name in (*TAKING, LOCAL_DAMPING, LOSS) else float(draw.choice([-1.0, 1.0]))
+    sign = -1.0 if name in (*TAKING, LOCAL_DAMPING, RUB, LOSS) else float(draw.choice([-1.0, 1.0]))
     if name == OFFSET:
         return _offset(chain, inner, draw)
     if name == GAIN:
         return _gain(chain, inner, draw)
-    if name == JUMP:
-        when = chain.span * draw.uniform(0.15, 0.85)
-        return Ingredient(name, site, {f"jump_{site + 1}": sign * chain.size}, 1.0, {"when": float(when)})
+    if name in (JUMP, RANGE, DROPPED):
+        when = {"when": float(chain.span * draw.uniform(0.15, 0.85))}
+        return {
+            JUMP: Ingredient(name, site, {f"jump_{site + 1}": sign * chain.size}, 1.0, when),
+            RANGE: Ingredient(name, site, {f"change_{site + 1}": sign}, 0.4, when),
+            DROPPED: Ingredient(name, None, {"lost": 1 / chain.fast}, 2.0, when),
+        }[name]
+    if name == CYCLIC:
+        return _cyclic(chain, site, draw)
+    if name in (SIDE_MASS, SWAYING):
+        return _swinging(name, chain, site, draw)
     if name in (AGEING, SLIP):
         return _changing(name, chain, sign, draw)
     if name == BONDS:
@@ -219,7 +241,7 @@ def ingredient(name: str, chain: Chain, site: int, sign: float = 1.0) -> Ingredi
     if name == MASSES:
         return Ingredient(name, site, {"scale": sign}, 0.9 if sign > 0 else 0.45, {})
     unit, most = _unit(name, chain)
-    placed = name in ("defect", LOCAL_DAMPING, BOND)
+    placed = name in ("defect", LOCAL_DAMPING, RUB, BOND)
     return Ingredient(name, site if placed else None, {"coefficient": sign * unit}, most, {})
 
 
@@ -243,6 +265,7 @@ def _unit(name: str, chain: Chain) -> tuple[float, float]:
     return {
         "damping": (1 / span, 4.0),
         "local-damping": (1 / span, 6.0),
+        "local-friction": (size * slow / span, 1.2),
         "bond-defect": (coupling, 0.5),
         "quadratic-drag": (1 / (slow * size * span), 5.0),
         "dry-friction": (size * slow / span, 0.8),
@@ -271,6 +294,30 @@ def _changing(name: str, chain: Chain, sign: float, draw: np.random.Generator) -
         return Ingredient(name, None, {f"ramp of {text}": value / chain.span}, 0.2, {})
     when = chain.span * draw.uniform(0.15, 0.85)
     return Ingredient(name, None, {f"step of {text}": value}, 0.2, {"when": float(when)})
+
+
+def _cyclic(chain: Chain, site: int, draw: np.random.Generator) -> Ingredient:
+    """Return an error of one sensor that repeats 0.4 to 3 times from zero to the largest swing."""
+    per_reading = 2 * np.pi / chain.size * np.exp(draw.uniform(np.log(0.4), np.log(3.0)))
+    phase = draw.uniform(0, 2 * np.pi)
+    size = 1 / float(per_reading)
+    waves = {f"sine_{site + 1}": size * np.cos(phase), f"cosine_{site + 1}": size * np.sin(phase)}
+    return Ingredient(CYCLIC, site, waves, 0.5, {"per_reading": float(per_reading)})
+
+
+def _swinging(name: str, chain: Chain, site: int, draw: np.random.Generator) -> Ingredient:
+    """Return a mass at one site, or the support of all; at first it is nearly where it hangs, and nearly at rest."""
+    omega = np.exp(draw.uniform(np.log(0.5 * chain.slow), np.log(1.4 * chain.fast)))
+    gamma = omega * np.exp(draw.uniform(np.log(0.003), np.log(0.1)))
+    y, rate = 0.03 * chain.size * draw.normal(size=2) * [1.0, omega]
+    if name == SWAYING:
+        return Ingredient(name, None, {"mass": 1.0}, 0.5 / chain.sites, _unread(omega, gamma, y, rate))
+    y, rate = chain.start[:, site] + [y, rate]
+    return Ingredient(name, site, {"mass": 1.0}, 0.3, _unread(omega, gamma, y, rate))
+
+
+def _unread(*numbers: float) -> dict[str, float]:
+    return dict(zip(NUMBERS[1:], map(float, numbers), strict=True))
 
 
 def _offset(chain: Chain, inner: ndarray, draw: np.random.Generator) -> Ingredient:

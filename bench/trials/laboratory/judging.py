@@ -35,11 +35,14 @@ OF_INSTRUMENT = {"drifting-zero": ("sensor-drift", "sensor-wander")}
 POWERS = {
     "onsite-quadratic": -1, "onsite-cubic": -2, "onsite-quintic": -4, "quadratic-coupling": -1,
     "nonlinear-coupling": -2, "quadratic-drag": -1, "nonlinear-damping": -2, "dry-friction": 1, "constant-force": 1,
-    "drive": 1, "local-drive": 1, "sensor-curve": -2, "sensor-saturation": -3, "sensor-gain": -1,
-    "sensor-crosstalk": -1, "sensor-gain-drift": -1,
+    "drive": 1, "local-drive": 1, "local-friction": 1, "sensor-curve": -2, "sensor-saturation": -3, "sensor-gain": -1,
+    "sensor-crosstalk": -1, "sensor-gain-drift": -1, "sensor-gain-jump": -1,
 }  # fmt: skip
 # The label of what a single sensor has.
-SENSOR = r"(offset|gain|curve|lag|jump|growth of the gain|delay) of u(\d+)(?: and v\d+)?(?: per time)?"
+SENSOR = (
+    r"(offset|gain|curve|lag|jump|growth of the gain|change of the gain|delay|sin|cos) of u(\d+)(?: and v\d+)?"
+    r"(?: per time)?"
+)
 # The label of a wave, and minus the time since which its phase is counted.
 WAVE = r"(?:hum of u\d*, )?(cos|sin)\(.*\*(?:t|\(t([+-][^()]*)\))\)"
 # The label of a declared term whose coefficient changes steadily.
@@ -55,6 +58,15 @@ NAMED = {
     "share of both neighbours in each reading": "crosstalk",
     "growth of the gain": "fade",
     "delay": "slow",
+    "change of the gain": "change",
+    "sin": "sine",
+    "cos": "cosine",
+    "per_reading": "per_reading",
+    "time that the clock loses": "lost",
+    "mass beside the site's": "mass",
+    "site's mass beside the support's": "mass",
+    "gamma": "gamma",
+    "drag": "drag",
 }
 # Half the width of a 95 % interval, in standard errors.
 HALF = 1.959964

@@ -20,6 +20,7 @@ from latticebench.bench.trials.information import explained
 from latticebench.bench.trials.laboratory.chains import Chain
 from latticebench.bench.trials.laboratory.effects import Ingredient
 from latticebench.bench.trials.laboratory.instruments import Instrument
+from latticebench.bench.trials.laboratory.unread import Unread
 from latticebench.methods.engine.bsplines import BSplines
 
 if TYPE_CHECKING:
@@ -225,7 +226,9 @@ class Experiment:
         chain, sites = self.chain, self.chain.sites
         start = np.stack([np.concatenate([of[f"start.{level}.{k}"] for k in range(sites)], axis=1) for level in (0, 1)])
         outer, beyond = self._outer, _Beyond.of(of, self._outer, self._border)
-        sensors = _Sensors(of, sites, float(self.times[-1]))
+        sensors, unread = _Sensors(of, sites, float(self.times[-1])), Unread.of(of)
+        if unread.sites:
+            start = np.concatenate([start, unread.start()], axis=2)
         known = ("start.", "border.")
         moving = {name: value for name, value in of.items() if not name.startswith(known) and np.any(value != 0)}
 
@@ -234,7 +237,8 @@ class Experiment:
 
         def rate(t: float, y: ndarray) -> ndarray:
             u, v = y.reshape(start.shape)
-            return np.concatenate([v.ravel(), chain.rate(t, held(t, u), v, moving).ravel()])
+            force = chain.rate(t, held(t, u[:, :sites]), v[:, :sites], moving)
+            return np.concatenate([v.ravel(), unread.pushed(force, u, v).ravel()])
 
         def lost(_t: float, y: ndarray) -> float:
             return BOUND * chain.size - float(np.max(np.abs(y[:sites])))
@@ -243,8 +247,8 @@ class Experiment:
         small = np.repeat([chain.size, chain.size * chain.fast], start[0].size) * tolerance * 0.1
         with np.errstate(all="ignore"):
             found = solve_ivp(
-                rate, (0.0, float(self.times[-1])), start.ravel(), t_eval=self.times, method="DOP853",
-                rtol=tolerance, atol=small, events=lost, dense_output=bool(np.any(sensors.lag) or np.any(sensors.slow)),
+                rate, (0.0, float(self.times[-1] + np.max(sensors.lost))), start.ravel(), t_eval=self.times,
+                method="DOP853", rtol=tolerance, atol=small, events=lost, dense_output=sensors.read_elsewhen,
             )  # fmt: skip
             if found.status != 0 or not np.all(np.isfinite(found.y)):
                 return None
@@ -260,7 +264,7 @@ class Experiment:
                     self.times,
                     lambda t: np.where(t < 0, back.sol(np.minimum(t, 0.0)), found.sol(t)).reshape(*start.shape, -1),
                 )
-        u = np.moveaxis(found.y.reshape(*start.shape, -1), -1, 1)[0]
+        u = np.moveaxis(found.y.reshape(*start.shape, -1), -1, 1)[0, :, :, :sites]
         rows = zip(self.times, u, behind, strict=True)
         return np.moveaxis(np.stack([sensors.read(float(t), held(float(t), row) + by) for t, row, by in rows]), 0, 1)
 
@@ -335,10 +339,21 @@ class _Sensors:
         self.curve, self.lag = of.get("curve", zero) + row("curve"), row("lag")
         self.cubic, self.crosstalk = of.get("cubic", zero), of.get("crosstalk", zero)
         self.fade, self.slow, self.span = row("fade"), row("slow"), span
-        jumping = [name.removeprefix("jump.jump@") for name in of if name.startswith("jump.jump")]
-        self.jumps = {int(k): [of[f"jump.{name}@{k}"] for name in ("jump", "when")] for k in jumping}
-        sites_that_hum = [name.removeprefix("hum.cos@") for name in of if name.startswith("hum.cos")]
-        self.hums = {int(k): [of[f"hum.{name}@{k}"] for name in ("cos", "sin", "omega")] for k in sites_that_hum}
+        self.lost, self.when = (of.get(f"frames.{name}", zero) for name in ("lost", "when"))
+
+        def each(kind: str, *names: str) -> dict[int, list[ndarray]]:
+            """Return these numbers of each sensor that has them."""
+            first = f"{kind}.{names[0]}@"
+            those = [name.removeprefix(first) for name in of if name.startswith(first)]
+            return {int(k): [of[f"{kind}.{name}@{k}"] for name in names] for k in those}
+
+        self.jumps, self.changes = each("jump", "jump", "when"), each("change", "change", "when")
+        self.hums, self.cycles = each("hum", "cos", "sin", "omega"), each("cycle", "sine", "cosine", "per_reading")
+
+    @property
+    def read_elsewhen(self) -> bool:
+        """Whether readings are of other times than they say."""
+        return any(np.any(late) for late in (self.lag, self.slow, self.lost))
 
     def behind(self, times: ndarray, motion: Callable[[ndarray], ndarray]) -> Float[ndarray, "time copies sites"]:
         """Return by how much positions were more when they were read.
@@ -348,8 +363,9 @@ class _Sensors:
             motion: u and v at given times (2, copies, sites, T).
         """
         now, found = np.moveaxis(motion(times)[0], -1, 0), np.zeros((len(times), *self.lag.shape))
-        for site in np.flatnonzero(np.any(self.lag, axis=0) | np.any(self.slow, axis=0)):
-            late = self.lag[:, site] + times[:, None] * self.slow[:, site]
+        lost = np.where(times[:, None] > self.when[:, 0], self.lost[:, 0], 0.0)
+        for site in np.flatnonzero(np.any(self.lag, axis=0) | np.any(self.slow, axis=0) | np.any(self.lost)):
+            late = self.lag[:, site] + times[:, None] * self.slow[:, site] - lost
             u, v = np.moveaxis(motion(times - late[:, 0])[:, :, site], -1, 1)
             # In a copy that is late by another time, to first order in that.
             found[..., site] = u - (late - late[:, :1]) * v - now[..., site]
@@ -365,12 +381,17 @@ class _Sensors:
             found[:, site] += (cos * np.cos(omega * t) + sin * np.sin(omega * t))[:, 0]
         for site, (jump, when) in self.jumps.items():
             found[:, site] += np.where(t > when, jump, 0.0)[:, 0]
+        for site, (change, when) in self.changes.items():
+            found[:, site] += np.where(t > when, change, 0.0)[:, 0] * u[:, site]
+        for site, (sine, cosine, per_reading) in self.cycles.items():
+            angle = per_reading[:, 0] * u[:, site]
+            found[:, site] += sine[:, 0] * np.sin(angle) + cosine[:, 0] * (np.cos(angle) - 1)
         return found
 
     def held(self, u: Float[ndarray, "copies sites"], outer: Sequence[int]) -> ndarray:
         """Return positions with the outer ones such that every copy has the readings of the first there.
 
-        Outer sensors neither hum, lag, jump, fade nor hear others.
+        Outer sensors neither hum, lag, jump, fade, repeat an error nor hear others.
         """
         if not outer:
             return u

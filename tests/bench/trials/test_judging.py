@@ -189,6 +189,12 @@ def test_values_have_the_names_that_recordings_have_for_them() -> None:
     assert later == {"cos": (4.0, 0.1), "sin": (5.0, 0.1), "middle": (-1e6, 0.0)}
     assert called({"cos(3.1*(t-12.5))": (4.0, 0.1)})["middle"] == (12.5, 0.0)
     assert called({"cos(u[n])": (1.0, 0.1)}) == {"coefficient": (1.0, 0.1)}
+    assert called({"cos of u2": (1.0, 0.1), "per_reading": (2.0, 0.1)}) == {
+        "cosine_2": (1.0, 0.1), "per_reading": (2.0, 0.1),
+    }  # fmt: skip
+    assert called({"change of the gain of u3": (1.0, 0.1), "gamma": (2.0, 0.1)}) == {
+        "change_3": (1.0, 0.1), "gamma": (2.0, 0.1),
+    }  # fmt: skip
 
 
 def test_a_residual_counts_readings_alone_each_over_the_noise_of_its_sensor() -> None:

@@ -96,13 +96,15 @@ def test_what_a_recording_cannot_tell_from_an_effect_is_said_beside_it() -> None
     assert gain.alike == ("asymmetric-coupling",)
 
 
-def moved(one: LabRecording, more: Sequence[tuple[float, str]] = (), ago: float | np.ndarray = 0.0) -> np.ndarray:
-    """Return positions at the first sixty times, or a while ago, by the declared terms and more: numbers and texts."""
+def moved(
+    one: LabRecording, more: Sequence[tuple[float, str]] = (), ago: float | np.ndarray = 0.0, rows: int = 60
+) -> np.ndarray:
+    """Return positions at the first times, or a while ago, by the declared terms and more: numbers and texts."""
     pieces = [*zip(one.coefficients.tolist(), one.declared.texts, strict=True), *more]
     term = Term(" + ".join(f"({size!r})*({text})" for size, text in pieces))
     motion = Motion(term, 2, is_complex=False, sites=one.chain.sites, ends=one.chain.ends)
-    times, start = one.samples.t[:60] - ago, motion.pack(*one.chain.start)
-    states = np.empty((len(start), 60))
+    times, start = one.samples.t[:rows] - ago, motion.pack(*one.chain.start)
+    states = np.empty((len(start), rows))
     for there, end in ((times < 0, -ago), (times >= 0, times[-1])):
         if np.any(there):
             states[:, there] = scipy.integrate.solve_ivp(
@@ -176,6 +178,68 @@ def test_sensors_that_hear_their_neighbours_fade_or_are_slow_read_what_their_wor
             assert 0 < value * span * one.chain.fast <= 0.5
             expected[:, wrong.site] = moved(one, ago=value * t)[:, wrong.site]
         np.testing.assert_allclose(expected, one.clean[:60], rtol=0, atol=1e-6 * one.chain.size)
+
+
+def test_a_range_that_changes_an_error_that_repeats_and_frames_that_are_lost_are_read_as_their_words_say() -> None:
+    for name in (effects.RANGE, effects.CYCLIC, effects.DROPPED):
+        one = make_recording(3, "white", [name], sites=3)
+        (wrong,) = one.effects
+        expected, t, of = moved(one), one.samples.t[:60], dict(wrong.parameters)
+        later = one.samples.t > of.get("when", np.inf)
+        if name == effects.DROPPED:
+            # The motion goes on beside the clock: what is read after the loss is what came later.
+            whole = moved(one, ago=-of["lost"], rows=len(later))
+            np.testing.assert_allclose(whole[later], one.clean[later], rtol=0, atol=1e-6 * one.chain.size)
+            assert 0 < of["lost"] * one.chain.fast <= 2
+        elif name == effects.RANGE:
+            whole, (change, _) = moved(one, rows=len(later)), of.values()
+            whole[later, wrong.site] *= 1 + change
+            np.testing.assert_allclose(whole, one.clean, rtol=0, atol=1e-6 * one.chain.size)
+        else:
+            sine, cosine, k = of.values()
+            angle = k * expected[:, wrong.site]
+            expected[:, wrong.site] += sine * np.sin(angle) + cosine * (np.cos(angle) - 1)
+        before = t <= of.get("when", np.inf)
+        np.testing.assert_allclose(expected[before], one.clean[:60][before], rtol=0, atol=1e-6 * one.chain.size)
+
+
+@pytest.mark.parametrize("name", [effects.SIDE_MASS, effects.SWAYING])
+def test_what_hangs_or_carries_and_is_not_read_moves_as_newton_says_for_an_observer_at_rest(name: str) -> None:
+    """In the coordinates of a resting observer, in which Newton's third law can be read off the equations."""
+    one = next(
+        found
+        for seed in range(1, 50)
+        if (found := make_recording(seed, "white", [name, "local-friction"], sites=3)).declared.texts == LINEAR
+        and found.chain.ends == "free"
+    )
+    (swings, rubs), (coupling, own) = one.effects, one.coefficients
+    of, chain = swings.parameters, one.chain
+    assert rubs.site is not None
+    thin = chain.size * chain.fast * 0.01
+
+    def rate(_: float, y: np.ndarray) -> np.ndarray:
+        x, w, speed = y[:3], y[3:6], y[7]
+        carried = name == effects.SWAYING
+        u, v = (x - y[6], w - speed) if carried else (x, w)
+        force = coupling * np.diff(np.diff(u, prepend=u[0], append=u[-1])) + own * u
+        force[rubs.site] += rubs.parameters["coefficient"] * np.tanh(v[rubs.site] / thin)
+        if carried:
+            # The support pushes each site by F of mass 1; its own mass is 1 / of["mass"].
+            back = -of["mass"] * force.sum() - of["omega"] ** 2 * y[6] - of["gamma"] * speed
+        else:
+            pull = of["omega"] ** 2 * (y[6] - u[swings.site]) + of["gamma"] * (speed - v[swings.site])
+            force[swings.site] += of["mass"] * pull
+            back = -pull
+        return np.concatenate([w, force, [speed, back]])
+
+    (place, speed), times = (of["y"], of["rate"]), one.samples.t[:60]
+    shift = np.array([place, speed]) if name == effects.SWAYING else np.zeros(2)
+    start = np.concatenate([chain.start[0] + shift[0], chain.start[1] + shift[1], [place, speed]])
+    exact = scipy.integrate.solve_ivp(
+        rate, (0.0, times[-1]), start, t_eval=times, method="DOP853", rtol=1e-10, atol=1e-10 * chain.size
+    ).y
+    seen = exact[:3] - exact[6] if name == effects.SWAYING else exact[:3]
+    np.testing.assert_allclose(seen.T, one.clean[:60], rtol=0, atol=1e-6 * chain.size)
 
 
 @pytest.mark.parametrize("names", [["local-drive", "local-damping", "bond-defect"]])
