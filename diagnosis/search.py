@@ -325,7 +325,7 @@ class Search:
                 if found is not None:
                     yield found
         yield from self._exchanged(fitted, pool)
-        for other, near in (*images(self.problem, fitted), *beside(fitted)):
+        for other, near in (*images(self.problem, fitted), *beside(self.problem, fitted)):
             found = None if other in pool else self.refit(other, fitted.layout, near, fitted, CHANGED)
             if found is not None:
                 yield found

@@ -1,8 +1,8 @@
-"""Effects that swing at one frequency, or act at one site, and one that does what they do.
+"""Effects that swing at one frequency, act at one time or at one site, and one that does what they do.
 
 A force at one site and one at all of the same frequency, opposite to each other, move one site alone: so does the hum
 of its sensor. No exchange of one effect leads from these two to that one. A force that pushes harder than all else does
-what the hum of a sensor does, too.
+what the hum of a sensor does, too. Likewise of kicks: one of all sites and one of the first of two move the second.
 
 A mass that hangs beside a site and is not read is felt there as another mass or another spring, as long as it swings at
 nearly one frequency, and as forces of that frequency.
@@ -25,6 +25,8 @@ MOST_OF_IT = 0.9
 # What is not read may take the place of all at its site if it can do this share, its frequency being known roughly; so
 # many frequencies are tried.
 SOME_OF_IT, BEST = 0.5, 3
+# Moments that are tried to either side of one.
+ABOUT = 6
 # Forces push harder than all else where that costs more nats.
 HARD = 1.0
 
@@ -33,10 +35,12 @@ def in_place(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Ite
     """Yield the numbers of effects of a model that swing together, with the candidate that does most of what they do.
 
     These are any two, and any one where forces push harder than all else. Frequencies are one where they differ by less
-    than half of what the longest recording resolves. Besides, each may have a more general case (`Placed.general`), and
-    what hangs beside a site may be in the place of several effects there, where it is among the candidates `open_`.
+    than half of what the longest recording resolves, times where they overlap. Besides, each may have a more general
+    case (`Placed.general`), and what hangs beside a site may be in the place of several effects there, where it is
+    among the candidates `open_`.
     """
     yield from _at_a_site(problem, tangent, open_)
+    yield from _at_once(problem, tangent)
     effects = tangent.fitted.model.effects
     swinging = [k for k, one in enumerate(effects) if one.frequency is not None]
     for k in swinging:
@@ -63,6 +67,32 @@ def in_place(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Ite
         best = max(without.scored(others), key=lambda one: one.won)
         if best.won > MOST_OF_IT * without.taken > 0:
             yield some, best.placed
+
+
+def _at_once(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ...], Placed]]:
+    """Yield the numbers of one or two effects that act for a while, with one that does so elsewhere or a little off.
+
+    A pulse a wave too late does part of what the true one does, and another kind may do more of it.
+    """
+    effects = tangent.fitted.model.effects
+    moments = {k: one.moment for k, one in enumerate(effects) if one.moment is not None}
+    places = {one.place: one for one in problem.candidates if one.moment is not None} if moments else {}
+    for some in (*((k,) for k in moments), *itertools.combinations(moments, 2)):
+        times, widths = zip(*(moments[k] for k in some), strict=True)
+        others = [one.at_moment(each) for one in places.values() for each in _about(problem, moments[some[0]])]
+        if np.ptp(times) > sum(widths) or not others:
+            continue
+        without = tangent.in_place_of(some)
+        best = max(without.scored(others), key=lambda one: one.won)
+        if best.won > (MOST_OF_IT if len(some) > 1 else 1.0) * without.taken > 0:
+            yield some, best.placed
+
+
+def _about(problem: Problem, moment: tuple[float, float]) -> Iterator[tuple[float, float]]:
+    """Yield moments about one, as far as half a wave to either side."""
+    (at, width), wave = moment, 2 * np.pi / problem.scene.top
+    for shift in wave * np.linspace(-0.5, 0.5, 2 * ABOUT + 1):
+        yield at + float(shift), width
 
 
 def _at_a_site(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Iterator[tuple[tuple[int, ...], Placed]]:

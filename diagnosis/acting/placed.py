@@ -200,6 +200,15 @@ class Placed(ABC):
         """Return it at another angular frequency, where it has one."""
         return self
 
+    @property
+    def moment(self) -> tuple[float, float] | None:
+        """The middle and the width of the time in which it acts; None where it acts all the time."""
+        return None
+
+    def at_moment(self, moment: tuple[float, float]) -> Self:  # noqa: ARG002
+        """Return it at another time, where it has one."""
+        return self
+
     def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:  # noqa: ARG002
         """Return those of its kind that act nearly, but plainly not as it does; none where no such order is known."""
         return ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -15,6 +15,8 @@ from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from numpy import ndarray
 
 # Middles that are tried of each width, at most, and the ratio of one width to the next.
@@ -88,6 +90,16 @@ class Pulse(Placed, acts="pulse"):
     def near(self) -> tuple[object, ...]:
         """The effect and its middle, to a width."""
         return (*self.place, f"{self.at / max(abs(self.width), 1e-300):.0f}")
+
+    @property
+    def moment(self) -> tuple[float, float]:
+        """Its middle and its width."""
+        return self.at, abs(self.width)
+
+    def at_moment(self, moment: tuple[float, float]) -> Self:
+        """Return it at another time, of another width."""
+        at, width = moment
+        return replace(self, at=at, width=width)
 
     def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:
         """Return the next pulses of its width, before and after, that hardly overlap with it."""

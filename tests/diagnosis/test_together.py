@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from latticebench.diagnosis.fitting import fit
+from latticebench.diagnosis.moments import beside
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.repair import diagnose
 from latticebench.diagnosis.score import Tangent
@@ -70,3 +72,42 @@ def test_where_the_length_of_a_pendulum_swings_the_sine_is_what_swings():
     size = np.hypot(*(value for value, _ in waves.values()))
     assert abs(size - 1) < 4 * max(error for _, error in waves.values())
     assert abs(values["omega"][0] - pump) < 4 * values["omega"][1]
+
+
+def tapped(at):
+    """Two sites between walls, of which the first is tapped."""
+    t = np.linspace(0, 40, 500)
+
+    def rate(t, y):
+        pull = 0.5 * (y[1] - 2 * y[0]) - y[0], 0.5 * (y[0] - 2 * y[1]) - y[1]
+        return [y[2], y[3], pull[0] + np.exp(-(((t - at) / 0.1) ** 2) / 2), pull[1]]
+
+    u = solve_ivp(rate, t[[0, -1]], [0.2, -0.4, 0, 0], t_eval=t, max_step=0.05, rtol=1e-9, atol=1e-10).y[:2].T
+    return Samples(t, u + 0.01 * np.random.default_rng(8).normal(size=u.shape), source="tapped", ends="fixed")
+
+
+def test_a_kick_of_all_sites_gives_way_to_one_of_a_site_at_another_time():
+    data, kicks = tapped(17.3), [find("kick"), find("local-kick")]
+    wrong = diagnose(DECLARED, 2, [data], kicks[:1]).after
+    problem = Problem.of(DECLARED, 2, [data], kicks)
+    singles = [(k, one) for (k, *others), one in in_place(problem, Tangent(wrong), problem.candidates) if not others]
+    assert wrong.model.effects
+    assert any(one.place == ("local-kick", 0) for _, one in singles)
+    (alone,) = diagnose(DECLARED, 2, [data], kicks).findings
+    assert (alone.name, alone.site) == ("local-kick", 0)
+    value, error = alone.values["at"]
+    assert abs(value - 17.3) < 4 * error
+
+
+def test_a_kick_half_a_wave_off_is_tried_where_something_is_left_about_it():
+    data = tapped(17.3)
+    problem = Problem.of(DECLARED, 2, [data], [find("local-kick")])
+    right = diagnose(DECLARED, 2, [data], [find("local-kick")]).after
+    (kick,), half = right.model.effects, np.pi / problem.main
+    assert not list(beside(problem, right))
+    other = kick.moved([-kick.strength[0], kick.at + half, kick.width])
+    wrong = fit(right.model.without(0).with_effect(other), right.layout, right.followed.nodes, structure=None)
+    assert wrong.cost > right.cost + 100
+    moved = [model.effects[0] for model, _ in beside(problem, wrong)]
+    assert min(abs(one.at - 17.3) for one in moved) < 0.25 * half
+    assert all(one.strength[0] * wrong.model.effects[0].strength[0] < 0 for one in moved)
