@@ -14,7 +14,7 @@ from latticebench.diagnosis.acceleration import with_rates
 from latticebench.diagnosis.fitting import Fitted, fit
 from latticebench.diagnosis.horizon import Layout
 from latticebench.diagnosis.model import Model
-from latticebench.diagnosis.past import past_of, with_unread
+from latticebench.diagnosis.past import past_of, with_known, with_unread
 from latticebench.diagnosis.problem import Problem
 from latticebench.diagnosis.reading import read_by
 from latticebench.methods.engine.dynamics import split_parts
@@ -126,7 +126,7 @@ def predict(fitted: Fitted, problem: Problem, held_out: Sequence[Samples] = ()) 
         layout = Layout.of(early, fitted.longest, None, fitted.layout.small, fitted.layout.memory)
     near = [nodes[rows] for nodes, rows in zip(early.nodes, layout.rows, strict=True)]
     if not held_out:
-        near = _from(fitted, layout, early)
+        near = _from(fitted, layout, problem)
     model = model.with_past(past_of(early, layout, model, near))
     near = list(with_unread(early, layout, model, near))
     layout = layout.with_substeps(model, near, other.top)
@@ -172,15 +172,14 @@ def _foreseeable(model: Model, end: float) -> Model:
     return replace(model, effects=tuple(one for one in model.effects if one.begins <= end))
 
 
-def _from(fitted: Fitted, layout: Layout, early: Problem) -> list[ndarray]:
-    """Return the states of a fit at the early rows."""
+def _from(fitted: Fitted, layout: Layout, problem: Problem) -> list[ndarray]:
+    """Return the states of a fit at the early rows, with those of what is not read: it may swing by itself."""
     found = []
     for number, rows in enumerate(layout.rows):
-        nodes = np.array(early.nodes[number])
+        nodes = np.array(problem.nodes[number])
         old, valid = fitted.layout.rows[number], fitted.layout.valid[number]
-        kept = valid & (old < len(nodes))
-        nodes[old[kept]] = fitted.followed.nodes[number][kept][:, : layout.plain.read]
-        found.append(nodes[rows])
+        nodes[old[valid]] = fitted.followed.nodes[number][valid][:, : layout.plain.read]
+        found.append(with_known(fitted, number, nodes)[rows])
     return found
 
 

@@ -2,7 +2,8 @@
 
 A force at one site and one at all of the same frequency, opposite to each other, move one site alone: so does the hum
 of its sensor. No exchange of one effect leads from these two to that one. A force that pushes harder than all else does
-what the hum of a sensor does, too. Likewise of kicks: one of all sites and one of the first of two move the second.
+what the hum of a sensor does, too. Likewise of kicks: one of all sites and one of the first of two move the second, and
+several in a row do what a force does that swings for a while.
 
 A mass that hangs beside a site and is not read is felt there as another mass or another spring, as long as it swings at
 nearly one frequency, and as forces of that frequency.
@@ -25,8 +26,12 @@ MOST_OF_IT = 0.9
 # What is not read may take the place of all at its site if it can do this share, its frequency being known roughly; so
 # many frequencies are tried.
 SOME_OF_IT, BEST = 0.5, 3
-# Moments that are tried to either side of one.
-ABOUT = 6
+# Moments that are tried to either side of one, and nats by which another one has to do better than it does.
+ABOUT, PLAINLY = 6, 1.0
+# So many kicks in a row may be a wave.
+ROW = 3
+# Forces are of about one frequency where they differ by less than this share of it.
+NEARLY = 0.03
 # Forces push harder than all else where that costs more nats.
 HARD = 1.0
 
@@ -41,6 +46,8 @@ def in_place(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Ite
     """
     yield from _at_a_site(problem, tangent, open_)
     yield from _at_once(problem, tangent)
+    yield from _in_a_row(problem, tangent)
+    yield from _ringing(problem, tangent, open_)
     effects = tangent.fitted.model.effects
     swinging = [k for k, one in enumerate(effects) if one.frequency is not None]
     for k in swinging:
@@ -84,8 +91,27 @@ def _at_once(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ..
             continue
         without = tangent.in_place_of(some)
         best = max(without.scored(others), key=lambda one: one.won)
-        if best.won > (MOST_OF_IT if len(some) > 1 else 1.0) * without.taken > 0:
+        enough = MOST_OF_IT * without.taken if len(some) > 1 else without.taken + 2 * PLAINLY
+        if best.won > enough > 0:
             yield some, best.placed
+
+
+def _in_a_row(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ...], Placed]]:
+    """Yield the numbers of all effects that act for a while at one place, with what swings there as long as they do."""
+    effects = tangent.fitted.model.effects
+    moments = {k: one.moment for k, one in enumerate(effects) if one.moment is not None}
+    for site in {effects[k].site for k in moments}:
+        here = tuple(k for k in moments if effects[k].site == site)
+        ends = [moments[k][0] + sign * moments[k][1] for k in here for sign in (-1, 1)]
+        every = (one.lasting(min(ends), max(ends)) for one in problem.candidates if one.site == site)
+        places = {one.place: one for one in every if one is not None}
+        if len(here) < ROW or not places:
+            continue
+        others = [one.tuned(float(omega)) for one in places.values() for omega in problem.scene.frequencies]
+        without = tangent.in_place_of(here)
+        for one in sorted(without.scored(others), key=lambda one: -one.won)[:BEST]:
+            if one.won > SOME_OF_IT * without.taken > 0:
+                yield here, one.placed
 
 
 def _about(problem: Problem, moment: tuple[float, float]) -> Iterator[tuple[float, float]]:
@@ -93,6 +119,21 @@ def _about(problem: Problem, moment: tuple[float, float]) -> Iterator[tuple[floa
     (at, width), wave = moment, 2 * np.pi / problem.scene.top
     for shift in wave * np.linspace(-0.5, 0.5, 2 * ABOUT + 1):
         yield at + float(shift), width
+
+
+def _ringing(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Iterator[tuple[tuple[int, ...], Placed]]:
+    """Yield the numbers of all forces on every site of about one frequency, with what may carry the sites and ring.
+
+    What rings by itself pushes as a force does that dies away, whatever its mass: a score does not know it.
+    """
+    effects = tangent.fitted.model.effects
+    forces = [k for k, one in enumerate(effects) if one.frequency and one.site is None and not one.instrument]
+    carriers = [one for one in open_ if one.site is None and one.resonator(problem.chain) is not None]
+    for first in forces if carriers else ():
+        omega = float(effects[first].frequency or 0.0)
+        alike = tuple(k for k in forces if abs(float(effects[k].frequency or 0.0) - omega) < NEARLY * omega)
+        if first == alike[0]:
+            yield alike, carriers[0].tuned(omega)
 
 
 def _at_a_site(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Iterator[tuple[tuple[int, ...], Placed]]:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # Frequencies that are tried are so many times the last, with a loss that makes the resonance as wide as they are apart.
 APART = 1.12
+# The loss of what rings, as a share of its frequency.
+RINGING = 0.01
 # A loss may seem to be a gain by this share of the frequency: a recording may not tell them apart.
 UNTOLD = 0.1
 # Steps between two readings on which a motion is taken for straight.
@@ -47,6 +49,10 @@ class Hanging(Placed):
     def near(self) -> tuple[object, ...]:
         """The place, with the frequency to one digit."""
         return (*self.place, f"{self.omega:.1g}")
+
+    def tuned(self, frequency: float) -> Self:
+        """Return it swinging at another angular frequency, and for long."""
+        return replace(self, omega=frequency, gamma=RINGING * frequency)
 
     def with_past(self, past: tuple[Factor, ...]) -> Self:
         """Return it beside sites that move in another way; what is still being forecast tells nothing."""

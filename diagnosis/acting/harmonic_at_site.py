@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from latticebench.diagnosis.acting.harmonic import Harmonic
+from latticebench.diagnosis.acting.lasting import SHARP, Lasting, windows
 from latticebench.diagnosis.acting.placed import AtOneSite, Placed
 from latticebench.diagnosis.acting.scene import Scene
 from latticebench.systems.effects import Effect
@@ -25,3 +26,13 @@ class HarmonicAtSite(AtOneSite, Harmonic, acts="harmonic at one site"):
                 yield cls(
                     effect=effect, texts=texts, omega=float(omega), middle=scene.middle, strength=still, here=here
                 )  # fmt: skip
+            for begin, end, middle in windows(scene) if len(scene.frequencies) else ():
+                yield BurstAtSite(
+                    effect=effect, texts=texts, omega=float(scene.frequencies[0]), middle=middle, strength=still,
+                    begin=begin, end=end, edge=SHARP / scene.top, seen=scene.seen, here=here,
+                )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BurstAtSite(Lasting, HarmonicAtSite):
+    """A force that swings for a while, at one site."""

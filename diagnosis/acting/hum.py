@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from latticebench.diagnosis.acting.harmonic import Swinging
 from latticebench.diagnosis.acting.placed import DIGITS, Force, Misreading, OfSensors, Placed
 from latticebench.diagnosis.acting.scene import Chain, Scene
+from latticebench.diagnosis.acting.swinging import Swinging
 from latticebench.systems.effects import Effect
 
 if TYPE_CHECKING:

@@ -209,6 +209,10 @@ class Placed(ABC):
         """Return it at another time, where it has one."""
         return self
 
+    def lasting(self, begin: float, end: float) -> Self | None:  # noqa: ARG002
+        """Return it from one time up to another; None where it acts all the time, or at one time."""
+        return None
+
     def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:  # noqa: ARG002
         """Return those of its kind that act nearly, but plainly not as it does; none where no such order is known."""
         return ()

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 # Frequencies are tried from this share of the main one up to so many times the highest: a stiff support yields without
 # swinging.
 LOWEST, HIGHEST = 0.2, 4.0
+# A site's mass beside that of a support which the sites do not move may seem to be negative by this.
+HEAVY = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,8 +56,8 @@ class SwayingSupport(Hanging, acts="support"):
 
     @property
     def possible(self) -> bool:
-        """Whether there is a mass, and it swings and loses."""
-        return self.strength[0] >= 0 and -UNTOLD * self.omega < self.gamma < self.omega
+        """Whether it swings and loses, and the sites do not move it the wrong way."""
+        return self.strength[0] > -HEAVY and -UNTOLD * self.omega < self.gamma < self.omega
 
     def resonator(self, chain: Chain) -> Resonator:
         """Return what swings with the sites."""
@@ -90,6 +92,6 @@ class SwayingSupport(Hanging, acts="support"):
 
     def sentences(self, chain: Chain) -> list[str]:  # noqa: ARG002
         """Return what carries the sites."""
-        mass = 1 / self.strength[0] if self.strength[0] > 0 else np.inf
+        mass = f"{1 / self.strength[0]:.{DIGITS}g} times a site's mass" if self.strength[0] > 0 else "far heavier"
         own = f"unloaded it would swing at {self.omega:.{DIGITS}g}"
-        return [f"all sites hang on a support that sways and is not read, {mass:.{DIGITS}g} times a site's mass; {own}"]
+        return [f"all sites hang on a support that sways and is not read, {mass}; {own}"]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from latticebench.diagnosis.acting import Chain, Force
-from latticebench.diagnosis.acting.harmonic import Wave
+from latticebench.diagnosis.acting.swinging import Wave
 from latticebench.diagnosis.unnamed.course import Course, courses, growing
 from latticebench.diagnosis.unnamed.nameless import EFFECT, Nameless
 from latticebench.methods.engine.dynamics import Factor

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from latticebench.diagnosis.acting.lasting import Lasted
+from latticebench.diagnosis.acting.swinging import Wave
 from latticebench.diagnosis.fitting import fit
 from latticebench.diagnosis.moments import beside
 from latticebench.diagnosis.problem import Problem
@@ -111,3 +115,55 @@ def test_a_kick_half_a_wave_off_is_tried_where_something_is_left_about_it():
     moved = [model.effects[0] for model, _ in beside(problem, wrong)]
     assert min(abs(one.at - 17.3) for one in moved) < 0.25 * half
     assert all(one.strength[0] * wrong.model.effects[0].strength[0] < 0 for one in moved)
+
+
+def read(rate, start, seed, sites=1, noise=0.005, t=None):
+    """Return what is read of the first sites of a motion."""
+    t = np.linspace(0, 40, 600) if t is None else t
+    found = solve_ivp(rate, t[[0, -1]], start, t_eval=t, max_step=0.05, rtol=1e-9, atol=1e-10).y
+    noisy = found[:sites].T + noise * np.random.default_rng(seed).normal(size=(len(t), sites))
+    return Samples(t, noisy, source="read", ends="free")
+
+
+def test_kicks_in_a_row_give_way_to_a_force_that_swings_for_a_while():
+    def rate(t, y):
+        return [y[1], -4 * y[0] - 0.05 * y[1] + (0.4 * np.sin(3.1 * t) if 13 < t < 24 else 0.0)]
+
+    effects = [find(name) for name in ("kick", "drive", "damping", "onsite-cubic")]
+    found = diagnose(library("spring", "u[n]"), 2, [read(rate, [0.3, 0.0], 3)], effects)
+    assert (found.verdict, {one.name for one in found.findings}) == ("explained", {"drive", "damping"})
+    (drive,) = (one for one in found.findings if one.name == "drive")
+    for name, true in (("omega", 3.1), ("begin", 13.0), ("end", 24.0)):
+        value, error = drive.values[name]
+        assert abs(value - true) < max(4 * error, 0.1)
+    assert found.forecast[1] < 0.5 * found.forecast[0]
+
+
+def test_a_force_that_dies_away_gives_way_to_a_heavy_support_that_rings():
+    def rate(_, y):
+        force = -9 * np.sin(y[:2]) + 2 * (y[1::-1] - y[:2]) - 0.02 * y[3:5]
+        push = -(4.6**2) * y[2] - 0.1 * y[5]
+        return [*y[3:], *(force - push), push]
+
+    effects = [find(name) for name in ("drive", "swaying-support", "damping", "sensor-hum")]
+    data = read(rate, [0.3, -0.2, 0.05, 0, 0, 0], 5, sites=2)
+    found = diagnose(library("pendula", "u[n+1]+u[n-1]-2*u[n]; sin(u[n])"), 2, [data], effects)
+    assert (found.verdict, {one.name for one in found.findings}) == ("explained", {"swaying-support", "damping"})
+    (support,) = (one for one in found.findings if one.name == "swaying-support")
+    value, error = support.values["omega"]
+    assert abs(value - 4.6) < 4 * error
+    assert found.forecast[1] < 2 * found.forecast_by_noise
+
+
+def test_a_wave_that_lasts_for_a_while_is_read_in_the_term_language_as_it_acts():
+    wave = Lasted(Wave("cos", 2.5, 3.0), 1.0, 4.0, 0.3)
+    t = np.linspace(0, 6, 50)
+    for by, step in (("begin", (1e-6, 0)), ("end", (0, 1e-6))):
+        up, down = (replace(wave, begin=1 + s * step[0], end=4 + s * step[1])(t) for s in (1, -1))
+        np.testing.assert_allclose(replace(wave, by=by)(t), (up - down) / 2e-6, atol=1e-8)
+    for one in (wave, replace(wave, by="begin"), replace(wave, by="end")):
+        values = eval(str(one), {"t": t, "cos": np.cos, "tanh": np.tanh})
+        np.testing.assert_allclose(values, one(t)[0, :, 0], rtol=1e-12)
+    beyond = (wave(np.array([-3.0, 9.0])), wave(np.array([2.5])))
+    np.testing.assert_allclose(beyond[0], 0, atol=1e-8)
+    np.testing.assert_allclose(beyond[1][0, 0, 0], np.cos(2.5 * -0.5), rtol=1e-3)
