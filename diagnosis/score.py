@@ -86,7 +86,7 @@ class _Responses:
         columns: of it, what initial states cannot do (readings, numbers).
     """
 
-    of: tuple[int, ...]
+    of: tuple[Placed, ...]
     whole: ndarray
     columns: ndarray
 
@@ -242,7 +242,7 @@ class Tangent:
 
     def _responses(self, batch: Sequence[Placed]) -> _Responses:
         """Return what numbers of effects do to the readings; those of the last candidates are kept."""
-        known = tuple(id(one) for one in batch)
+        known = tuple(batch)
         if not self._kept or self._kept[0].of != known:
             flat = self._whitened(batch)
             whole = np.linalg.norm(flat.reshape(-1, flat.shape[-1]), axis=0)

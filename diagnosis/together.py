@@ -28,6 +28,8 @@ MOST_OF_IT = 0.9
 SOME_OF_IT, BEST = 0.5, 3
 # Moments that are tried to either side of one, and nats by which another one has to do better than it does.
 ABOUT, PLAINLY = 6, 1.0
+# Sites that are tried in its place, to either side.
+FAR = 2
 # So many kicks in a row may be a wave.
 ROW = 3
 # Forces are of about one frequency where they differ by less than this share of it.
@@ -52,13 +54,15 @@ def in_place(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Ite
     swinging = [k for k, one in enumerate(effects) if one.frequency is not None]
     for k in swinging:
         alike = [one for one in problem.candidates if one.general and one.effect is effects[k].effect]
-        others = [one.tuned(float(effects[k].frequency or 0.0)) for one in alike if one.place != effects[k].place]
+        here = [one for one in alike if one.site == effects[k].site and one.place != effects[k].place]
+        others = [one.tuned(float(effects[k].frequency or 0.0)) for one in here]
         if not others:
             continue
         without = tangent.in_place_of([k])
         best = max(without.scored(others), key=lambda one: one.won)
-        if best.won > without.taken:
-            yield (k,), best.placed
+        if best.won > without.taken + 2 * PLAINLY:
+            finer = without.scored(list(best.placed.sharper()))
+            yield (k,), max((best, *finer), key=lambda one: one.won).placed
     alone = [(k,) for k in swinging] if pushed(tangent.fitted) > HARD else []
     # One of each kind and place; all are tuned to the same frequency.
     waves = (one for one in problem.candidates if one.frequency is not None and not one.general)
@@ -86,8 +90,12 @@ def _at_once(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, ..
     places = {one.place: one for one in problem.candidates if one.moment is not None} if moments else {}
     for some in (*((k,) for k in moments), *itertools.combinations(moments, 2)):
         times, widths = zip(*(moments[k] for k in some), strict=True)
-        others = [one.at_moment(each) for one in places.values() for each in _about(problem, moments[some[0]])]
-        if np.ptp(times) > sum(widths) or not others:
+        if np.ptp(times) > sum(widths):
+            continue
+        there, sites = moments[some[0]], [effects[k].site for k in some]
+        near = [one for one in places.values() if one.site is None or any(_beside(one.site, site) for site in sites)]
+        others = [one.at_moment(each) for one in near for each in _about(problem, there)]
+        if not others:
             continue
         without = tangent.in_place_of(some)
         best = max(without.scored(others), key=lambda one: one.won)
@@ -114,6 +122,11 @@ def _in_a_row(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, .
                 yield here, one.placed
 
 
+def _beside(site: int, other: int | None) -> bool:
+    """Return whether a site is one that a kick may have come to instead."""
+    return other is None or abs(site - other) <= FAR
+
+
 def _about(problem: Problem, moment: tuple[float, float]) -> Iterator[tuple[float, float]]:
     """Yield moments about one, as far as half a wave to either side."""
     (at, width), wave = moment, 2 * np.pi / problem.scene.top
@@ -127,11 +140,13 @@ def _ringing(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Ite
     What rings by itself pushes as a force does that dies away, whatever its mass: a score does not know it.
     """
     effects = tangent.fitted.model.effects
-    forces = [k for k, one in enumerate(effects) if one.frequency and one.site is None and not one.instrument]
-    carriers = [one for one in open_ if one.site is None and one.resonator(problem.chain) is not None]
-    for first in forces if carriers else ():
-        omega = float(effects[first].frequency or 0.0)
-        alike = tuple(k for k in forces if abs(float(effects[k].frequency or 0.0) - omega) < NEARLY * omega)
+    chain = problem.chain
+    swinging = {k: abs(one.frequency) for k, one in enumerate(effects) if one.frequency and one.site is None}
+    forces = {k: omega for k, omega in swinging.items() if {one.text for one in effects[k].forces(chain)} == {"1"}}
+    carriers = [one for one in open_ if one.site is None and one.resonator(chain) is not None]
+    carried = any(one.site is None and one.resonator(chain) is not None for one in effects)
+    for first, omega in forces.items() if carriers and not carried else ():
+        alike = tuple(k for k, other in forces.items() if abs(other - omega) <= NEARLY * omega)
         if first == alike[0]:
             yield alike, carriers[0].tuned(omega)
 

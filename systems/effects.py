@@ -17,8 +17,8 @@ from latticebench.systems.parser import TermError, parse
 HOW: dict[str, str] = {
     "everywhere": "the formula, at every site and time",
     "harmonic": "the formula times cos(omega s) and sin(omega s), s counted from the middle, at every site alike; "
-    "omega found",
-    "harmonic at one site": "the same at one site only; omega and site found",
+    "omega found, and begin and end where it does not last",
+    "harmonic at one site": "the same at one site only; omega and site found, and begin and end where it does not last",
     "pulse": "the formula times exp(-((t - at) / width)^2 / 2), at every site alike; at and width found",
     "pulse at one site": "the same at one site only; at, width and site found",
     "ramp": "a declared term, or the formula, times s / T, s counted from the middle, T being the length of "

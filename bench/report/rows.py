@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING
 
-from latticebench.bench.report.units import Units, of_coefficients, with_unit
+from latticebench.bench.report.units import WHILE, Units, of_coefficients, with_unit
 from latticebench.diagnosis import rules
 
 if TYPE_CHECKING:
@@ -142,7 +143,8 @@ def _lines(report: Report) -> list[tuple[float, str]]:
     return [
         (float(one.parameters["omega"]), one.effect)
         for one in report.effects
-        if "omega" in one.parameters and all(name.removesuffix("*i*1").endswith(")") for name in one.coefficients)
+        if "omega" in one.parameters
+        and all(re.sub(WHILE, "", name).removesuffix("*i*1").endswith(")") for name in one.coefficients)
     ]
 
 

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 # Digits of a number within a sentence.
 DIGITS = 4
 # Numbers of effects that are times; what stands before a term that acts with a sign at every second site, or in time.
-TIMES = ("delay", "at", "width")
+TIMES = ("delay", "at", "width", "begin", "end")
+# What stands behind a term that acts for a while.
+WHILE = r"\*\[[^\]]*\]$"
 ZERO = r"(?:offset|drift|walk|hum|lag|jump) of \w+(?: in recording \d+ beyond others)?"
 SINCE = r"(?:t|\(t[^()]*\))"
 IN_TIME = (
@@ -98,7 +100,8 @@ def of_natural(name: str, units: Units, order: int = 2) -> tuple[float, str]:
     if name in TIMES or name.endswith(" time") or name.startswith("lag "):
         return 1.0, units.time
     try:
-        term = Term(re.sub(IN_TIME, "", re.sub(r"(?: at site \d+|\(t-[^()]*\))$", "", name)) or "1")
+        always = re.sub(WHILE, "", name)
+        term = Term(re.sub(IN_TIME, "", re.sub(r"(?: at site \d+|\(t-[^()]*\))$", "", always)) or "1")
     except TermError:
         return 1.0, ""
     return 1.0, of_coefficient(term, order, units)

@@ -80,7 +80,6 @@ class Burst(Lasting, Harmonic):
         import sympy
 
         t = sympy.Symbol("t", real=True)
-        on = sympy.And(*([] if "begin" in self.moot else [t > decimal(self.begin)]),
-                       *([] if "end" in self.moot else [t < decimal(self.end)]))  # fmt: skip
-        plain = super().summands(chain)
-        return [replace(one, body=sympy.Piecewise((one.body, on), (0, True))) for one in plain]
+        signs = {"begin": 1, "end": -1}
+        steps = [sympy.Heaviside(signs[name] * (t - decimal(time))) for name, time in self.times().items()]
+        return [replace(one, body=sympy.Mul(one.body, *steps)) for one in super().summands(chain)]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import bisect
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from latticebench.diagnosis.acting.placed import DIGITS, Force, InStep, since
+from latticebench.diagnosis import rules
+from latticebench.diagnosis.acting.placed import Force, InStep, Placed, since
 from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.diagnosis.acting.swinging import Swinging, Wave
 
@@ -79,6 +81,48 @@ class Lasting(Swinging):
         """The place of what swings all the time, and that this does not."""
         return (*super().place, "for a while")
 
+    @property
+    def near(self) -> tuple[object, ...]:
+        """The place and the frequency, with the times in radians of it."""
+        return (*super().near, *(f"{self.omega * time:.0f}" for time in self.times().values()))
+
+    def beside(self, others: Sequence[Placed]) -> Sequence[Placed]:
+        """Return it at the next frequencies to both sides, of those that outside influences may have."""
+        alike = [one for one in others if isinstance(one, Swinging) and one.effect is self.effect]
+        every = sorted({one.omega for one in alike if not one.general})
+        here = bisect.bisect(every, self.omega)
+        near, far, still = rules.LINE, rules.AROUND, replace(self, strength=(0.0,) * len(self.strength))
+        chosen = [*every[max(here - far, 0) : max(here - near, 0)], *every[here + near : here + far]]
+        return [still.tuned(omega) for omega in chosen]
+
+    def times(self) -> dict[Switch, float]:
+        """Return when it is switched on and off within the recordings, with as many digits as that has a meaning."""
+        digits = 1 - int(np.floor(np.log10(self.edge)))
+        return {name: round(float(getattr(self, name)), digits) for name in SWITCHES if name not in self.moot}
+
+    def sharper(self) -> Iterator[Self]:
+        """Yield it switched on and off at times about its own, an eighth of it and a quarter away."""
+        quarter = (min(self.end, self.seen[1]) - max(self.begin, self.seen[0])) / 8
+        shifts = [(0.0,) if name in self.moot else quarter * np.arange(-2, 3.0) for name in SWITCHES]
+        still = replace(self, strength=(0.0,) * len(self.strength))
+        for early, late in itertools.product(*shifts):
+            yield still.lasting(self.begin + float(early), self.end + float(late))
+
+    @property
+    def switched(self) -> Iterator[Self]:
+        """The same, switched on or off a quarter of a wave earlier or later, or as long beyond a zero as before it.
+
+        Between, the wave pushes as much to one side as to the other: small steps do not find the way.
+        """
+        half, (a, b) = np.pi / abs(self.omega), self.strength[:: len(self.texts)]
+        zero = self.middle + float(np.arctan2(-a, b)) / self.omega
+        for name, time in self.times().items():
+            before = zero + half * float(np.floor((time - zero) / half))
+            for other in (time - half / 2, time + half / 2, 2 * before - time, 2 * (before + half) - time):
+                yield self.moved(
+                    [*self.numbers[:-2], *(other if each == name else getattr(self, each) for each in SWITCHES)]
+                )
+
     def lasting(self, begin: float, end: float) -> Self:
         """Return it from one time up to another, its phase counted from the middle between."""
         return replace(self, begin=begin, end=end, middle=_round((begin + end) / 2, end - begin))
@@ -100,10 +144,14 @@ class Lasting(Swinging):
         return -np.inf if "begin" in self.moot else self.begin
 
     def labels(self, chain: Chain) -> tuple[str, ...]:
-        """Return cosine and sine of each term, and when."""
-        begin = "" if "begin" in self.moot else f" from t = {self.begin:.{DIGITS}g}"
-        end = "" if "end" in self.moot else f" up to t = {self.end:.{DIGITS}g}"
-        return tuple(f"{label}{begin}{end}" for label in super().labels(chain))
+        """Return cosine and sine of each term, with the times when they act in Iverson's bracket, [t > 5]."""
+        times = {name: f"{time:.15g}" for name, time in self.times().items()}
+        during = "t"
+        if "begin" in times:
+            during = f"{times['begin']} < t" if "end" in times else f"t > {times['begin']}"
+        if "end" in times:
+            during = f"{during} < {times['end']}"
+        return tuple(f"{label}*[{during}]" if times else label for label in super().labels(chain))
 
     def waves(self, chain: Chain) -> list[Force]:
         """Return the waves and, for frequency and times, their derivatives by them."""
@@ -129,7 +177,8 @@ def windows(scene: Scene) -> Iterator[tuple[float, float, float]]:
     apart = scene.span / PARTS
     for first, last in itertools.combinations(range(PARTS + 1), 2):
         if last - first < PARTS:
-            begin, end = (scene.begin + apart * k for k in (first - (first == 0), last + (last == PARTS)))
+            begin = scene.begin + apart * first if first else scene.seen[0] - apart
+            end = scene.begin + apart * last if last < PARTS else scene.seen[1] + apart
             yield begin, end, _round((begin + end) / 2, end - begin)
 
 

@@ -129,13 +129,16 @@ def test_kicks_in_a_row_give_way_to_a_force_that_swings_for_a_while():
     def rate(t, y):
         return [y[1], -4 * y[0] - 0.05 * y[1] + (0.4 * np.sin(3.1 * t) if 13 < t < 24 else 0.0)]
 
-    effects = [find(name) for name in ("kick", "drive", "damping", "onsite-cubic")]
+    effects = [find(name) for name in ("kick", "drive", "damping", "onsite-cubic", "side-mass", "clock-jump")]
     found = diagnose(library("spring", "u[n]"), 2, [read(rate, [0.3, 0.0], 3)], effects)
     assert (found.verdict, {one.name for one in found.findings}) == ("explained", {"drive", "damping"})
     (drive,) = (one for one in found.findings if one.name == "drive")
     for name, true in (("omega", 3.1), ("begin", 13.0), ("end", 24.0)):
         value, error = drive.values[name]
-        assert abs(value - true) < max(4 * error, 0.1)
+        assert abs(value - true) < 4 * error < 0.2
+    during = next(label for label in drive.values if label.startswith("cos")).partition("*[")[2]
+    assert during.startswith(("12.9", "13.0"))
+    assert " < t < 2" in during
     assert found.forecast[1] < 0.5 * found.forecast[0]
 
 

@@ -72,7 +72,8 @@ def test_a_coefficient_has_the_unit_of_the_derivative_over_that_of_its_term(
     ("name", "expected"),
     [
         ("v[n]", "1/s"), ("u[n] at site 3", "1/s^2"), ("(-1)^k*u[n]", "1/s^2"), ("cos(2.5*t)", "mm/s^2"),
-        ("cos(2.5*(t-12.5))", "mm/s^2"),
+        ("cos(2.5*(t-12.5))", "mm/s^2"), ("cos(2.5*(t-12.5))*[5.5 < t < 19]", "mm/s^2"), ("begin", "s"), ("end", "s"),
+        ("sin(2.5*t)*u[n]*[t > 3]", "1/s^2"),
         ("sin(2.5*t)*u[n]", "1/s^2"),
         ("sin(2.5*(t+3))*u[n]", "1/s^2"), ("exp(-((t-3)/0.5)**2/2)", "mm/s^2"),
         ("exp(-((t+3.2)/0.5)**2/2)", "mm/s^2"), ("exp(-(t/0.5)**2/2)*u[n]", "1/s^2"),
