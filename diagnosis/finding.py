@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from latticebench.diagnosis import rules
@@ -16,6 +16,8 @@ HOPE = 30.0
 # Alternatives of an effect that are fitted in full, each of another name, and the share of its evidence that their
 # score must come to.
 MOST_ALTERNATIVES, COMPARABLE = 3, 0.5
+# Models of less than so many nats apart, with as many numbers, are the same.
+SAME = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +73,30 @@ def compared(search: Search, fitted: Fitted) -> Compared:
             if search.value(best) < search.value(fitted) - search_margin(best, fitted):
                 better = best
                 break
+            better = _said_first(search, fitted, number, found.models)
+            if better is not None:
+                break
             evidence.append(found.evidence)
             alternatives.append(found.equal)
         if better is None:
             return Compared(fitted, tuple(evidence), tuple(alternatives))
         fitted = better
     return Compared(fitted, tuple(evidence), tuple(alternatives))
+
+
+def _said_first(search: Search, fitted: Fitted, number: int, models: Sequence[Fitted]) -> Fitted | None:
+    """Return a model that is the same, but for an effect that the catalogue has before another; None for none.
+
+    Of effects that do exactly the same here, rounding would choose.
+    """
+    order = {name: k for k, name in enumerate(dict.fromkeys(one.effect.name for one in search.problem.candidates))}
+    own, count = fitted.model.effects[number], len(fitted.model.effects)
+    for other in models:
+        placed = other.model.effects[-1] if len(other.model.effects) == count else own
+        alike = abs(other.cost - fitted.cost) < SAME * fitted.dispersion and placed.count == own.count
+        if alike and order.get(placed.effect.name, count) < order.get(own.effect.name, -1):
+            return other
+    return None
 
 
 def search_margin(one: Fitted, other: Fitted) -> float:

@@ -137,18 +137,27 @@ def _about(problem: Problem, moment: tuple[float, float]) -> Iterator[tuple[floa
 def _ringing(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Iterator[tuple[tuple[int, ...], Placed]]:
     """Yield the numbers of all forces on every site of about one frequency, with what may carry the sites and ring.
 
-    What rings by itself pushes as a force does that dies away, whatever its mass: a score does not know it.
+    What rings by itself pushes as a force does that dies away, whatever its mass: a score does not know it. A force
+    dies away where another one of nearly its frequency is there besides, or would be worth its price.
     """
-    effects = tangent.fitted.model.effects
-    chain = problem.chain
+    effects, chain = tangent.fitted.model.effects, problem.chain
     swinging = {k: abs(one.frequency) for k, one in enumerate(effects) if one.frequency and one.site is None}
     forces = {k: omega for k, omega in swinging.items() if {one.text for one in effects[k].forces(chain)} == {"1"}}
     carriers = [one for one in open_ if one.site is None and one.resonator(chain) is not None]
     carried = any(one.site is None and one.resonator(chain) is not None for one in effects)
     for first, omega in forces.items() if carriers and not carried else ():
         alike = tuple(k for k, other in forces.items() if abs(other - omega) <= NEARLY * omega)
-        if first == alike[0]:
+        if first == alike[0] and (len(alike) > 1 or _dies_away(problem, tangent, effects[first])):
             yield alike, carriers[0].tuned(omega)
+
+
+def _dies_away(problem: Problem, tangent: Tangent, force: Placed) -> bool:
+    """Return whether a force of nearly the frequency of one in the model would be worth its price besides."""
+    omega, lines = abs(force.frequency or 0.0), np.pi / problem.scene.span * np.array([-2, -1, 1, 2])
+    waves = [one for one in problem.candidates if one.place == force.place][:1]
+    near = [omega + float(line) for line in (*lines, -NEARLY * omega, NEARLY * omega)]
+    others = tangent.scored([one.tuned(omega) for one in waves for omega in near])
+    return max((one.gain for one in others), default=0.0) > problem.price_of(force)
 
 
 def _at_a_site(problem: Problem, tangent: Tangent, open_: Sequence[Placed]) -> Iterator[tuple[tuple[int, ...], Placed]]:

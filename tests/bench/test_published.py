@@ -169,6 +169,21 @@ def test_the_page_on_the_diagnosis_says_what_the_tables_of_laboratory_recordings
     assert f"in {', '.join(others)} and {last} laboratory recordings" in readme
 
 
+def test_the_page_on_the_diagnosis_says_how_often_what_hangs_or_rubs_and_what_is_off_was_named() -> None:
+    hangs, ranges = (
+        pd.read_csv(RESULTS / "loop" / name / "summary.csv", comment="#", dtype=str).iloc[0]
+        for name in ("hangs", "ranges")
+    )
+    assert f"`results/loop/hangs`): {share(hangs['right'])}, and intervals" in words("diagnosis")
+    assert f"hold the true size in {share(hangs['intervals that hold'])}. Friction" in words("diagnosis")
+    held = pd.read_csv(RESULTS / "loop" / "hangs" / "effects.csv", comment="#", dtype=str).set_index("effect")["named"]
+    assert f"Friction at one site was named in {share(held['local-friction'])}, a mass" in words("diagnosis")
+    assert f"a mass beside one in {share(held['side-mass'])}, a support in" in words("diagnosis")
+    assert f"a support in {share(held['swaying-support'])}: forces" in words("diagnosis")
+    assert f"`results/loop/ranges`): {share(ranges['right'])}, and intervals" in words("diagnosis")
+    assert f"the true size in {share(ranges['intervals that hold'])}. Of other" in words("diagnosis")
+
+
 def test_the_page_on_the_diagnosis_says_what_the_table_of_white_and_slow_noise_says() -> None:
     slow = pd.read_csv(RESULTS / "loop" / "slow" / "summary.csv", comment="#", dtype=str).iloc[0]
     page = words("diagnosis")
