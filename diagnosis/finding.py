@@ -16,7 +16,7 @@ HOPE = 30.0
 # Alternatives of an effect that are fitted in full, each of another name, and the share of its evidence that their
 # score must come to.
 MOST_ALTERNATIVES, COMPARABLE = 3, 0.5
-# Models of less than so many nats apart, with as many numbers, are the same.
+# Models of which one is better by less than so many nats are the same.
 SAME = 0.02
 
 
@@ -93,7 +93,7 @@ def _said_first(search: Search, fitted: Fitted, number: int, models: Sequence[Fi
     own, count = fitted.model.effects[number], len(fitted.model.effects)
     for other in models:
         placed = other.model.effects[-1] if len(other.model.effects) == count else own
-        alike = abs(other.cost - fitted.cost) < SAME * fitted.dispersion and placed.count == own.count
+        alike = abs(search.value(other) - search.value(fitted)) < SAME
         if alike and order.get(placed.effect.name, count) < order.get(own.effect.name, -1):
             return other
     return None
