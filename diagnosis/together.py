@@ -110,11 +110,11 @@ def _in_a_row(problem: Problem, tangent: Tangent) -> Iterator[tuple[tuple[int, .
     moments = {k: one.moment for k, one in enumerate(effects) if one.moment is not None}
     for site in {effects[k].site for k in moments}:
         here = tuple(k for k in moments if effects[k].site == site)
+        if len(here) < ROW:
+            continue
         ends = [moments[k][0] + sign * moments[k][1] for k in here for sign in (-1, 1)]
         every = (one.lasting(min(ends), max(ends)) for one in problem.candidates if one.site == site)
         places = {one.place: one for one in every if one is not None}
-        if len(here) < ROW or not places:
-            continue
         others = [one.tuned(float(omega)) for one in places.values() for omega in problem.scene.frequencies]
         without = tangent.in_place_of(here)
         for one in sorted(without.scored(others), key=lambda one: -one.won)[:BEST]:

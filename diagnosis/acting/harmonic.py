@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from latticebench.diagnosis.acting.lasting import SHARP, Lasting, windows
+from latticebench.diagnosis.acting.lasting import Lasting, windows
 from latticebench.diagnosis.acting.placed import Force, Placed, Summand, decimal
 from latticebench.diagnosis.acting.scene import Chain, Scene
+from latticebench.diagnosis.acting.step import SHARP
 from latticebench.diagnosis.acting.swinging import Swinging
 from latticebench.systems.effects import Effect
 from latticebench.systems.terms import Term

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from latticebench.diagnosis.acting.harmonic import Harmonic
-from latticebench.diagnosis.acting.lasting import SHARP, Lasting, windows
+from latticebench.diagnosis.acting.lasting import Lasting, windows
 from latticebench.diagnosis.acting.placed import AtOneSite, Placed
 from latticebench.diagnosis.acting.scene import Scene
+from latticebench.diagnosis.acting.step import SHARP
 from latticebench.systems.effects import Effect
 
 

@@ -23,8 +23,6 @@ Switch = Literal["begin", "end"]
 
 # The recording is cut into so many parts, at the ends of which something may be switched on or off.
 PARTS = 6
-# Switching takes this share of the shortest time in which the motion changes by a radian: see `step.SHARP`.
-SHARP = 0.1
 SWITCHES: tuple[Switch, ...] = ("begin", "end")
 
 
