@@ -3,8 +3,8 @@
     python results/loop/rules.py [JOBS [FOLDER [NAME ...]]]
 
 Each number of `diagnosis/rules.py` is switched off, halved and doubled, one at a time. The same recordings are
-diagnosed every time, so that a rule is judged by the recordings whose answer it changes. What rules.csv already has is
-not computed again. FOLDER has the measured recordings; without it, or with "", they are left out. Only the rules and
+diagnosed every time, and with the rules as they are at the same commit, so that a rule is judged by the recordings
+whose answer it changes. What rules.csv already has is not computed again. FOLDER has the measured recordings; without it, or with "", they are left out. Only the rules and
 the kinds of recordings that are named are tried, or else all.
 """
 
@@ -224,8 +224,12 @@ def compute(jobs: int, folder: Path | None, only: Sequence[str]) -> pd.DataFrame
         if value in ("half", "double"):
             asked = {(kind, name) for kind, name in asked if kind not in ("unnamed", "measured")}
         work = [one for one in every if one[0] in kinds and one[:2] in asked - have]
+        here = rows[(rows["rule"] == AS_IS) & (rows["commit"] == commit())]
+        have = set(zip(here["kind"], here["recording"], strict=True))
+        beside = [] if rule == AS_IS else [(AS_IS, "", None, one) for one in work if one[:2] not in have]
         with ProcessPoolExecutor(jobs) as pool:
-            for one in as_completed([pool.submit(diagnosed, rule, value, changed, case, folder) for case in work]):
+            asking = [*beside, *((rule, value, changed, one) for one in work)]
+            for one in as_completed([pool.submit(diagnosed, *what, folder) for what in asking]):
                 row = pd.DataFrame([one.result()])
                 rows = pd.concat([rows, row], ignore_index=True) if len(rows) else row
                 write_text(HERE / "rules.csv", rows.to_csv(index=False))
@@ -239,11 +243,11 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     tried = set(map(tuple, rows.loc[rows["rule"] != AS_IS, names].to_numpy().tolist()))
     rows = rows[[pair in tried for pair in zip(rows["kind"], rows["recording"], strict=True)]]
     rows = rows.assign(right=rows["right"].astype(str) == "True")
-    base = rows[rows["rule"] == AS_IS].set_index(names)
+    base = rows[rows["rule"] == AS_IS]
     found = []
     for (rule, value), group in rows.groupby(["rule", "value"], sort=False):
-        here = group.set_index(names)
-        there = base.loc[here.index]
+        here = group.drop_duplicates(names, keep="last").set_index(names)
+        there = _as_they_are(here, base)
         other = (here["named"] != there["named"]) | (here["verdict"] != there["verdict"])
         gained, lost = (int(np.sum(one & ~two)) for one, two in ((here["right"], there["right"]),
                                                                   (there["right"], here["right"])))  # fmt: skip
@@ -255,6 +259,16 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
         line["time"] = f"{here['seconds'].sum() / there['seconds'].sum():.2f}"
         found.append(line)
     return pd.DataFrame(found)
+
+
+def _as_they_are(here: pd.DataFrame, base: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of the same recordings with no rule changed: of the same commit, or else the latest."""
+    names = ["kind", "recording"]
+    exact = base.drop_duplicates(["commit", *names]).set_index(["commit", *names])
+    latest = base.drop_duplicates(names, keep="last").set_index(names)
+    pairs = [(commit, *name) for commit, name in zip(here["commit"], here.index, strict=True)]
+    found = [exact.loc[pair] if pair in exact.index else latest.loc[pair[1:]] for pair in pairs]
+    return pd.DataFrame(found, index=here.index)
 
 
 def _said(rule: str) -> str:
