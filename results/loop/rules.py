@@ -4,8 +4,8 @@
 
 Each number of `diagnosis/rules.py` is switched off, halved and doubled, one at a time. The same recordings are
 diagnosed every time, and with the rules as they are at the same commit, so that a rule is judged by the recordings
-whose answer it changes. What rules.csv already has is not computed again. FOLDER has the measured recordings; without it, or with "", they are left out. Only the rules and
-the kinds of recordings that are named are tried, or else all.
+whose answer it changes. What rules.csv already has is not computed again. FOLDER has the measured recordings; without
+it, or with "", they are left out. Only the rules and the kinds of recordings that are named are tried, or else all.
 """
 
 from __future__ import annotations
