@@ -200,7 +200,8 @@ def known() -> pd.DataFrame:
 
 def short(rows: pd.DataFrame, every: Sequence[tuple[str, str, Case]]) -> set[tuple[str, str]]:
     """Return the recordings that rules are tried on, by what they take with the rules as they are."""
-    base = rows[rows["rule"] == AS_IS].set_index(["kind", "recording"])["seconds"]
+    names = ["kind", "recording"]
+    base = rows[rows["rule"] == AS_IS].drop_duplicates(names).set_index(names)["seconds"]
     kept = {(kind, name) for kind, name, _ in every if kind not in ("missing", "nothing")}
     for kind in ("missing", "nothing"):
         names = [name for other, name, _ in every if other == kind]
