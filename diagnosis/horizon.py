@@ -40,6 +40,8 @@ CHORD = 0.1
 # Steps of the integrator per typical interval, at most: friction that jumps would have as many as it is given.
 # In a gap, which lasts as long as several, it is at least so many for each of them.
 MOST_SUBSTEPS, MOST_IN_GAPS = 8, 2
+# Looking ahead over a step with dry friction takes as long as so many stages.
+AHEAD = 3
 # Numbers of the states of all intervals below which the time goes into calls, not into numbers.
 SMALL_BATCH = 5000
 # A piece of fewer rows says nothing.
@@ -184,7 +186,8 @@ class Layout:
         # Where the one of low order may take no more steps, it would need twice as many at least.
         counted = [steps * np.where(enough, 1, 2) for steps, enough in zip(short, short_enough, strict=True)]
         falls_short = any(np.any(one & ~other) for one, other in zip(long_enough, short_enough, strict=True))
-        if 6 * sum(map(np.sum, counted)) < 12 * sum(map(np.sum, long)) and not falls_short:
+        ahead = AHEAD if model.rubs else 0
+        if (6 + ahead) * sum(map(np.sum, counted)) < (12 + ahead) * sum(map(np.sum, long)) and not falls_short:
             return replace(ways[0], substeps=short)
         return replace(ways[1], substeps=long)
 

@@ -38,9 +38,8 @@ Watcher = Callable[[str], None]
 
 # Errors of the integrator become smaller where what is left does by this factor.
 FINER = 4.0
-# From one fit to the next dry friction acts like a viscous one below a speed so many times as low, down to this share
-# of the first, while that brings so many nats.
-SHARPER, ABRUPT, HELPED = 3.0, 0.02, 0.5
+# Nats that dry friction which jumps must bring beside one that is viscous at low speeds.
+HELPED = 0.5
 # Gauss-Newton steps of a first fit, of one at the next horizon, and of one with an effect more or less.
 FIRST, CARRIED, CHANGED = 40, 25, 10
 # A model that cannot be followed over long pieces at once begins on the second horizon and climbs so many at a time.
@@ -242,8 +241,8 @@ class Search:
     ) -> Fitted | None:
         """Return the fit of a model; None where it cannot be followed or comes to no cost below `hope`.
 
-        Dry friction is made more abrupt from fit to fit, as long as that helps; where the fit that this one starts from
-        has been through that, it has to come below `hope` before.
+        Dry friction is viscous at low speeds at first, and jumps after that if it fits better so; where the fit that
+        this one starts from has been through that, it has to come below `hope` before.
         """
         if not model.rubs:
             return self._refit(model, layout, near, start, steps, hope)
@@ -257,13 +256,9 @@ class Search:
             if found is None:
                 resting = layout.resting(rest).with_substeps(model, near, self.problem.top)
                 found = self._refit(model, resting, near, start, steps, least)
-        while found is not None and found.layout.plain.rest > ABRUPT * soft:
-            resting = found.layout.resting(found.layout.plain.rest / SHARPER)
-            resting = resting.with_substeps(found.model, found.followed.nodes, self.problem.top)
-            sharper = self._refit(found.model, resting, found.followed.nodes, found, steps, found.cost - HELPED)
-            if sharper is None:
-                break
-            found = sharper
+        if found is not None and found.layout.plain.rest > 0:
+            abrupt = found.layout.resting(0.0).with_substeps(found.model, found.followed.nodes, self.problem.top)
+            found = self._refit(found.model, abrupt, found.followed.nodes, found, steps, found.cost - HELPED) or found
         return found if found is not None and found.cost < hope else None
 
     def _refit(

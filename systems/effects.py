@@ -52,8 +52,8 @@ HOW: dict[str, str] = {
     "gain jump": "the reading is (1 + c) u from one time on; at one site; time and site found",
     "crosstalk": "the reading is u + c times u of the sensors next to it, of the one on one side, or the mean of all",
     "imbalance": "the reading of a complex field is z + c conj(z), with one c for all sites",
-    "lag": "the reading is u a time tau ago; at one site, which is found, with a tau for every site, or with one more "
-    "tau at each",
+    "lag": "the reading is u a time tau ago; at one site, which is found, with a tau for every site, with one more tau "
+    "at each, or, beside a measured input, with one tau for all",
     "sensor clock": "the reading is u at a time that is late by c (t - t_0); at one site, or from one on",
     "clock": "the recorded times are wrong by a share of themselves",
     "clock jump": "from one time on readings are of a later time than they say; time found",

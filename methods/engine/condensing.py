@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from latticebench.methods.engine.sensitivity import CHUNK, TAIL, Stretches, Transition
+from latticebench.methods.engine.colouring import TAIL
+from latticebench.methods.engine.sensitivity import CHUNK, Stretches, Transition
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

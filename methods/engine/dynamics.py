@@ -5,9 +5,8 @@
 The right-hand side is linear in the coefficients xi, so the values of the terms are its derivatives by them. The
 derivatives by the state come from the term language and are exact.
 
-Dry friction, sign(v), jumps where a site turns round and holds a site that is at rest. So that it can be integrated and
-derived, it counts as viscous below a speed that is chosen, or as its mean over one step of the integrator, which
-becomes the jump as the steps get shorter (`Dynamics.linear`).
+Dry friction, sign(v), jumps where a site turns round and holds a site that is at rest; see
+`latticebench.methods.engine.friction` for how it is integrated and derived.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Dynamics:
             (parts, B, N). The term 1 (1+i for a complex field) with a factor is an arbitrary known force.
         least_reach: least width of the stencil to the left and to the right. With it, equations of different terms
             leave the same sites without an equation at unknown ends.
-        rest: speed below which dry friction is viscous; 0 to take its mean over a step.
+        rest: speed below which dry friction is viscous; 0 for friction that jumps.
         resonators: of which nothing is read; their y and y' come after u and v in the state.
     """
 
@@ -140,15 +139,9 @@ class Dynamics:
         driven: Float[ndarray, "batch order parts border"] | None = None,
         *,
         derivatives: bool = True,
-        step: Float[ndarray, " batch"] | None = None,
+        sliding: Float[ndarray, "batch moving"] | None = None,
     ) -> tuple[ndarray, ndarray, dict[tuple[int, Slot], ndarray]]:
         """Evaluate the right-hand side and its derivatives.
-
-        For steps of length h, the term sign(v[n]) is replaced by tanh(2 v / (h b)), where b is the larger of the
-        acceleration by all other terms and of the friction's own. Where a site turns round, this is about the mean of
-        sign(v) over the step. Where a site is at rest, it is a friction that stops the site within a step and holds it
-        against any smaller acceleration (as in Moreau's time stepping, Nonsmooth Mechanics and Applications (1988)).
-        Derivatives keep b fixed. Where `rest` is given, it is tanh(v / rest) instead.
 
         Args:
             coefficients: xi.
@@ -157,7 +150,7 @@ class Dynamics:
             f: measured input at all sites; needed if a term uses it.
             driven: u and, for order 2, v of the sites that have no equation.
             derivatives: whether the derivatives by the state are wanted.
-            step: length h of the integrator's step for each state; None leaves sign(v[n]) as it is.
+            sliding: what stands for sign(v[n]) in dry friction; None leaves it as it is. Derivatives keep it fixed.
 
         Returns:
             dy/dt (B, S); the values of the terms with their weights and factors (parts, terms, B, M); for each part of
@@ -173,6 +166,8 @@ class Dynamics:
         for function, places, alike in self._values:
             for part, value in enumerate(function(*[read[of][where] for of, where in places])):
                 values[part, alike if len(alike) > 1 else alike[0]] = value
+        if sliding is not None:
+            values[0, self.rubbing] = sliding
         if self.weights is not None:
             values *= self.weights[:, None, self.moving]
         factors = self._factors(t)
@@ -182,8 +177,6 @@ class Dynamics:
         rate = np.empty((len(t), self.order, self.parts, self.count))
         if self.order == 2:
             rate[:, 0] = y[:, : self.read].reshape(rate.shape)[:, 1]
-        if step is not None and self._rubbing:
-            found = self._softened(coefficients, values, rate[:, 0, 0], step, factors, derivatives)
         summed = np.matmul(coefficients, values.reshape(self.parts, len(self.terms), -1))
         rate[:, -1] = summed.reshape(self.parts, *shape).swapaxes(0, 1)
         if derivatives:
@@ -283,42 +276,19 @@ class Dynamics:
         return total
 
     @functools.cached_property
-    def _rubbing(self) -> tuple[int, ...]:
+    def rubbing(self) -> list[int]:
         """The numbers of the terms that are dry friction."""
         if self.order == 1 or self.is_complex:
-            return ()
-        return tuple(k for k, term in enumerate(self.terms) if term.jumps)
+            return []
+        return [k for k, term in enumerate(self.terms) if term.jumps]
 
-    @functools.cached_property
-    def _smooth(self) -> Int[ndarray, " others"]:
-        """The numbers of the other terms."""
-        return np.delete(np.arange(len(self.terms)), self._rubbing)
-
-    def _softened(
-        self,
-        coefficients: ndarray,
-        values: ndarray,
-        v: ndarray,
-        step: ndarray,
-        factors: dict[int, ndarray],
-        derivatives: bool,
-    ) -> dict[tuple[int, Slot], ndarray]:
-        """Replace dry friction in `values` by one without a jump, and return its derivative by v."""
-        others = self._smooth
-        pushes = values[0, others].reshape(len(others), v.size)
-        push = np.abs(np.dot(coefficients[None, others], pushes)).reshape(v.shape)
-        total = np.zeros_like(v)
-        for term in self._rubbing:
-            size = np.ones_like(v) if self.weights is None else self.weights[term, self.moving] * np.ones_like(v)
-            if term in factors:
-                size = size * factors[term][0]
-            over_a_step = step[:, None] / 2 * np.maximum(push, np.abs(coefficients[term] * size))
-            width = self.rest or np.maximum(over_a_step, np.finfo(float).tiny)
-            soft = np.tanh(v / width)
-            values[0, term] = size * soft
-            if derivatives:
-                total += coefficients[term] * size * (1 - soft**2) / width
-        return {(0, Slot("v", 0, "re")): total} if derivatives else {}
+    def rubbing_sizes(self, t: Float[ndarray, " batch"]) -> Float[ndarray, "rubbing batch moving"]:
+        """Return weight times factor of each term that is dry friction."""
+        found, factors = np.ones((len(self.rubbing), len(t), self.count)), self._factors(t)
+        for size, term in zip(found, self.rubbing, strict=True):
+            size *= 1.0 if self.weights is None else self.weights[term, self.moving]
+            size *= factors[term][0] if term in factors else 1.0
+        return found
 
     def _factors(self, t: ndarray) -> dict[int, ndarray]:
         """Evaluate the factors at the sites that have an equation; each is (parts, B, M)."""

@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from latticebench.methods.engine.bsplines import BSplines
+from latticebench.methods.engine.colouring import spread, spread_dense
 from latticebench.methods.engine.dynamics import Dynamics
-from latticebench.systems.compiler import Slot
+from latticebench.methods.engine.variational import Outside, Rates
 
 if TYPE_CHECKING:
     import scipy.sparse
@@ -38,10 +39,6 @@ CHUNK = 200_000
 MAX_SUBSTEPS = 256
 # Inputs are evaluated in this part of a step.
 INSIDE = 1 - 1e-9
-# The largest share of a disturbance that may be left beyond its reach.
-TAIL = 1e-9
-# Where terms read more places than this of each part, all sites are taken to couple: one product of matrices is faster.
-WIDE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,11 +124,11 @@ class Stretches:
         """Integrate each stretch in its number of steps; the end is not finite where the motion is unbounded."""
         end = np.empty_like(start)
         dynamics, coefficients = self.dynamics.acting(coefficients)
-        acting = replace(self, dynamics=dynamics)
+        acting, rates = replace(self, dynamics=dynamics), Rates(dynamics, coefficients, by_terms=False, driving=0)
         with np.errstate(all="ignore"):
             for count in np.unique(substeps):
                 chosen = np.flatnonzero(substeps == count)
-                end[chosen] = acting._march(coefficients, chosen, start[chosen], None, int(count), splines)[0]
+                end[chosen] = acting._march(rates, chosen, start[chosen], None, int(count), splines)[0]
         return end
 
     def substeps(
@@ -241,8 +238,9 @@ class Stretches:
         dynamics = self.dynamics
         size, count, blocks = dynamics.size, dynamics.count, dynamics.order * dynamics.parts
         states = blocks * colours + size - dynamics.read
-        terms = len(dynamics.terms) + sum(one.numbers for one in dynamics.resonators) if by_terms else 0
         extra = self._driving
+        rates = Rates(dynamics, coefficients, by_terms, extra)
+        terms = rates.numbers
         seeds = self._seeds(states + terms + extra, colours)
         stretches = len(start)
         end = np.empty_like(start)
@@ -255,16 +253,14 @@ class Stretches:
                 alike = np.flatnonzero(substeps == number)
                 for chosen in np.split(alike, np.arange(chunk, len(alike), chunk)):
                     varied = np.broadcast_to(seeds[:, :, None], (*seeds.shape, len(chosen)))
-                    end[chosen], z = self._march(
-                        coefficients, chosen, start[chosen], varied, int(number), splines, by_terms=by_terms
-                    )
+                    end[chosen], z = self._march(rates, chosen, start[chosen], varied, int(number), splines)
                     z = np.moveaxis(z, -1, 0)
                     by_state[chosen] = z[:, :states]
                     by_coefficient[chosen] = z[:, states : states + terms]
                     if by_drive is not None:
                         by_drive[chosen] = z[:, states + terms :]
         if colours < count:
-            by_state = (_spread_dense if dense else _spread)(by_state, dynamics, colours, far)
+            by_state = (spread_dense if dense else spread)(by_state, dynamics, colours, far)
             if by_state is None:
                 return None
         return Transition(end, by_state, by_coefficient, by_drive, self._active[0] if extra else None)
@@ -281,14 +277,12 @@ class Stretches:
 
     def _march(
         self,
-        coefficients: ndarray,
+        rates: Rates,
         chosen: ndarray,
         y: ndarray,
         z: ndarray | None,
         count: int,
         splines: ndarray | None,
-        *,
-        by_terms: bool = True,
     ) -> tuple[ndarray, Any]:
         """Take `count` steps with the states y (B, S) and, if given, their derivatives z (columns, S, B)."""
         a, b, c = self._tableau
@@ -296,128 +290,44 @@ class Stretches:
         h = (self.end[chosen] - begin) / count
         slopes_y = np.empty((len(b), *y.shape))
         slopes_z = None if z is None else np.empty((len(b), *z.shape))
+        rubs = bool(self.dynamics.rubbing)
+        # Where there is dry friction, the motion is looked ahead to the middle of each step.
+        shares = np.append(c[: len(b)], 0.5) if rubs else c[: len(b)]
         for step in range(count):
-            times = begin + (step + c[: len(b), None]) * h
-            # Of all stages at once: on short chains each call costs more than what it does.
-            curves, basis = self._at_border(times, splines, slopes=z is not None)
-            for stage, t in enumerate(times):
+            outside = self._outside(chosen, h, step, shares[:, None], splines, slopes=z is not None)
+            rubbed = rates.rubbed(h, y, z, outside[0], outside[-1]) if rubs else None
+            for stage, at in enumerate(outside[: len(b)]):
                 at_y, at_z = y, z
                 if stage:
                     at_y = y + h[:, None] * _combine(a[stage, :stage], slopes_y)
                     if z is not None:
                         at_z = z + h * _combine(a[stage, :stage], slopes_z)
-                # An input that is held jumps from one step to the next: each sees its own side.
-                inside = begin + (step + 0.5 + INSIDE * (c[stage] - 0.5)) * h
-                f = None if self.inputs is None else self.inputs(inside)
-                curve = None if curves is None else curves[stage]
-                rate, values, slopes = self.dynamics.linear(
-                    coefficients, t, at_y, f, curve, derivatives=z is not None, step=h
-                )
-                slopes_y[stage] = rate
-                if slopes_z is not None:
-                    at = None if basis is None else basis[stage]
-                    self._vary_rate(slopes_z[stage], at_z, values, slopes, at, chosen, by_terms=by_terms)
-                    if self.dynamics.resonators:
-                        force = np.tensordot(coefficients, values[0], 1)
-                        self._vary_unread(slopes_z[stage], at_z, at_y, force, by_terms=by_terms)
+                sliding = () if rubbed is None else rubbed.at(c[stage])
+                slopes_y[stage] = rates.at(at, at_y, at_z, None if slopes_z is None else slopes_z[stage], *sliding)
             y = y + h[:, None] * _combine(b, slopes_y)
             if z is not None:
                 z = z + h * _combine(b, slopes_z)
         return y, z
 
-    def _at_border(
-        self, times: Float[ndarray, "stage batch"], splines: ndarray | None, *, slopes: bool
-    ) -> tuple[list[ndarray] | None, list[tuple[ndarray, ndarray, ndarray]] | None]:
-        """Return the motion of the sites without an equation and, for `slopes`, the B-splines, at times of stages."""
+    def _outside(
+        self, chosen: ndarray, h: ndarray, step: int, shares: ndarray, splines: ndarray | None, *, slopes: bool
+    ) -> list[Outside]:
+        """Return what acts from outside at shares (stages, 1) of a step; for `slopes` with the border's B-splines."""
+        begin = self.begin[chosen]
+        times = begin + (step + shares) * h
+        # Of all stages at once: on short chains each call costs more than what it does.
         flat, stages = times.ravel(), len(times)
         driven = self.driven(flat, splines)
-        curves = None if driven is None else list(driven.reshape(*times.shape, *driven.shape[1:]))
-        if self.drive is None or self.held or not slopes:
-            return curves, None
-        first, value, slope = (np.split(one, stages) for one in self.drive.basis(flat))
-        return curves, list(zip(first, value, slope, strict=True))
-
-    def _vary_rate(
-        self,
-        out: ndarray,
-        z: Any,
-        values: ndarray,
-        slopes: dict[tuple[int, Slot], ndarray],
-        basis: tuple[ndarray, ndarray, ndarray] | None,
-        chosen: ndarray,
-        *,
-        by_terms: bool,
-    ) -> None:
-        """Write d/dt of the derivatives z (columns, S, B) into `out`.
-
-        The batch is the last axis, so that the innermost loops are long even on short chains.
-        """
-        dynamics = self.dynamics
-        order, parts, count = dynamics.order, dynamics.parts, dynamics.count
-        columns, terms = len(z), len(dynamics.terms)
-        batch = len(chosen)
-        unread = sum(one.numbers for one in dynamics.resonators) if by_terms else 0
-        blocks = z[:, : dynamics.read].reshape(columns, order, parts, count, batch)
-        field, extra = blocks, 0
-        if len(dynamics.border):
-            field = np.zeros((columns, order, parts, dynamics.sites, batch))
-            field[..., dynamics.moving, :] = blocks
-        if basis is not None:
-            first, width = self._active
-            border = dynamics.border
-            extra = width * parts * len(border)
-            at, *curves = basis
-            place = at[:, None] - first[chosen][:, None] + np.arange(curves[0].shape[1])
-            rows = np.arange(batch)[:, None]
-            # The columns of the drive: spline coefficient, part, site.
-            for part in range(parts):
-                for number, site in enumerate(border):
-                    column = columns - extra + (place * parts + part) * len(border) + number
-                    for level in range(order):
-                        field[column, level, part, site, rows] = curves[level]
-        target = out[:, : dynamics.read].reshape(columns, order, parts, count, batch)
-        if order == 2:
-            target[:, 0] = blocks[:, 1]
-        target[:, -1] = 0.0
-        if len(slopes) > WIDE * parts**2 and not len(dynamics.border):
-            product = self._jacobian(slopes, batch) @ np.transpose(z[:, : dynamics.read], (2, 1, 0))
-            target[:, -1] = np.transpose(product, (2, 1, 0)).reshape(target[:, -1].shape)
-        else:
-            padded = dynamics.stencil.pad(field, after=1)
-            for (part, slot), slope in slopes.items():
-                window = padded[dynamics.window(slot)]
-                target[:, -1, part] += (np.atleast_2d(slope).T if np.ndim(slope) else slope) * window
-        if by_terms:
-            own = columns - extra - unread - terms
-            target[own : own + terms, -1] += np.transpose(values, (1, 0, 3, 2))
-
-    def _vary_unread(self, out: ndarray, z: Any, y: ndarray, force: ndarray, *, by_terms: bool) -> None:
-        """Write d/dt of the resonators' derivatives, and add what they do to those of their sites.
-
-        Their states are y, and the terms push with `force` (B, M).
-        """
-        dynamics = self.dynamics
-        first = len(z) - self._driving - sum(one.numbers for one in dynamics.resonators)
-        varied = dynamics.felt(np.swapaxes(z, 0, 1), np.swapaxes(out[:, dynamics.count : dynamics.read], 0, 1))
-        felt = dynamics.felt(y.T, force.T)
-        for (one, place, v), change, own in zip(dynamics.beside, varied, felt, strict=True):
-            swing, pushed = np.tensordot(one.slopes, change, 1)
-            out[:, place], out[:, place + 1] = z[:, place + 1], swing
-            out[:, v] += pushed[:, None]
-            if by_terms:
-                for number, (swing, pushed) in enumerate(one.by_numbers(own), first):
-                    out[number, place + 1] += swing
-                    out[number, v] += pushed
-                first += one.numbers
-
-    def _jacobian(self, slopes: dict[tuple[int, Slot], ndarray], batch: int) -> Float[ndarray, "batch rate state"]:
-        """Return the derivatives of the highest rates (parts, sites) by the states, for sites that couple to many."""
-        dynamics, sites = self.dynamics, np.arange(self.dynamics.count)
-        found = np.zeros((batch, dynamics.parts, dynamics.count, dynamics.order, dynamics.parts, dynamics.count))
-        for (part, slot), slope in slopes.items():
-            place, factor = dynamics.stencil.neighbours(slot.vector)
-            found[:, part, sites, slot.place[0], slot.place[1], place] += slope * factor
-        return found.reshape(batch, dynamics.parts * dynamics.count, dynamics.read)
+        curves = [None] * stages if driven is None else list(driven.reshape(*times.shape, *driven.shape[1:]))
+        # An input that is held jumps from one step to the next: each sees its own side.
+        inside = begin + (step + 0.5 + INSIDE * (shares - 0.5)) * h
+        inputs = [None if self.inputs is None else self.inputs(one) for one in inside]
+        basis: list[Any] = [None] * stages
+        if self.drive is not None and not self.held and slopes:
+            first, value, slope = (np.split(one, stages) for one in self.drive.basis(flat))
+            within = self._active[0][chosen, None] - np.arange(value[0].shape[1])
+            basis = [(at[:, None] - within, *known) for at, *known in zip(first, value, slope, strict=True)]
+        return [Outside(*one) for one in zip(times, inputs, curves, basis, strict=True)]
 
     @functools.cached_property
     def _tableau(self) -> tuple[ndarray, ndarray, ndarray]:
@@ -433,67 +343,3 @@ def _combine(weights: ndarray, slopes: ndarray | None) -> ndarray:
     assert slopes is not None
     used = slopes[: len(weights)]
     return np.asarray((weights @ used.reshape(len(weights), -1)).reshape(used.shape[1:]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Derivatives of sites by sites of their neighbourhood.
-
-    Attributes:
-        entries: (pair, stretch, block of the start, block of the end).
-        source, target: the sites of each pair.
-    """
-
-    entries: ndarray
-    source: ndarray
-    target: ndarray
-
-    @classmethod
-    def of(cls, grouped: ndarray, dynamics: Dynamics, colours: int, far: int) -> _Pairs | None:
-        """Separate the sites of each group; None where the effects of two sites overlap."""
-        count, blocks = dynamics.count, dynamics.order * dynamics.parts
-        ring = dynamics.stencil.is_ring
-        site = np.arange(count)
-        offset = np.arange(-far, far + 1)
-        source = site[:, None] + offset
-        inside = np.ones(source.shape, dtype=bool) if ring else (source >= 0) & (source < count)
-        target = np.broadcast_to(site[:, None], source.shape)[inside]
-        source = (source % count)[inside]
-        edge = np.abs(np.broadcast_to(offset, inside.shape)[inside]) == far
-        shaped = grouped.reshape(len(grouped), blocks, colours, blocks, count)
-        # NumPy puts the axis of the paired indices first.
-        entries = shaped[:, :, source % colours, :, target]
-        if np.any(edge) and np.max(np.abs(entries[edge]), initial=0.0) > TAIL * np.max(np.abs(entries)):
-            return None
-        return cls(entries, source, target)
-
-
-def _spread(grouped: ndarray, dynamics: Dynamics, colours: int, far: int) -> list[scipy.sparse.csr_array] | None:
-    """Return one sparse (S, S) matrix per stretch, with rows for the start; None where effects overlap."""
-    import scipy.sparse
-
-    pairs = _Pairs.of(grouped, dynamics, colours, far)
-    if pairs is None:
-        return None
-    count, blocks = dynamics.count, dynamics.order * dynamics.parts
-    into, out = np.meshgrid(np.arange(blocks), np.arange(blocks), indexing="ij")
-    rows = (into[None] * count + pairs.source[:, None, None]).ravel()
-    columns = (out[None] * count + pairs.target[:, None, None]).ravel()
-    # All stretches have their entries in the same places, which are sorted once.
-    order = np.lexsort((columns, rows))
-    indices = columns[order].astype(np.int32)
-    pointers = np.searchsorted(rows[order], np.arange(dynamics.size + 1)).astype(np.int32)
-    entries = np.moveaxis(pairs.entries, 1, 0).reshape(len(grouped), -1)[:, order]
-    shape = (dynamics.size, dynamics.size)
-    return [scipy.sparse.csr_array((one, indices, pointers), shape=shape) for one in entries]
-
-
-def _spread_dense(grouped: ndarray, dynamics: Dynamics, colours: int, far: int) -> ndarray | None:
-    """Return the (K, S, S) derivatives of the ends by the start; None where effects overlap."""
-    pairs = _Pairs.of(grouped, dynamics, colours, far)
-    if pairs is None:
-        return None
-    count, blocks = dynamics.count, dynamics.order * dynamics.parts
-    found = np.zeros((len(grouped), blocks, count, blocks, count))
-    found[:, :, pairs.source, :, pairs.target] = pairs.entries
-    return found.reshape(len(grouped), dynamics.size, dynamics.size)

@@ -73,6 +73,27 @@ def test_channels_that_are_read_one_after_the_other_lag_in_turn():
         assert value == pytest.approx(lag, abs=4 * error)
 
 
+@pytest.mark.parametrize(("late", "is_named"), [(0.03, True), (-0.02, True), (0.0, False)])
+def test_beside_a_measured_input_all_sensors_may_lag_behind_that(late, is_named):
+    def force(t):
+        return np.cos(1.3 * t) + np.cos(2.9 * t + 1) + np.cos(5.3 * t + 2) + np.cos(7.7 * t + 3)
+
+    def rate(t, y):
+        return [y[1], -20 * y[0] - 0.3 * y[1] + 2 * force(t)]
+
+    t = T[::2]
+    motion = solve_ivp(rate, (-1.0, T[-1] + 1), [0.3, 0.0], rtol=1e-10, atol=1e-12, t_eval=t - late).y[0]
+    u = motion[:, None] + NOISE * np.random.default_rng(2).normal(size=(len(t), 1))
+    samples = Samples(t, u, source="driven", ends="free", f=force(t)[:, None])
+    found = diagnose(library("driven", "u[n]; v[n]; f[n]"), 2, [samples], CATALOGUE)
+    assert found.verdict == ("explained" if is_named else "nothing missing")
+    assert [one.name for one in found.findings] == ["sensor-lag"] * is_named
+    for one in found.findings:
+        value, error = one.values["lag behind the input"]
+        assert value == pytest.approx(late, abs=4 * error)
+        assert one.site is None
+
+
 @pytest.mark.slow
 def test_behind_a_filter_of_first_order_a_sensor_lags_and_reads_less():
     constant, t = 0.05, np.linspace(-2, T[-1], 168_001)

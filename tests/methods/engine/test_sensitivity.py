@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from latticebench import systems
-from latticebench.methods.engine import sensitivity
+from latticebench.methods.engine import variational
 from latticebench.methods.engine.dynamics import Dynamics
 from latticebench.methods.engine.sensitivity import Stretches
 from latticebench.systems.simulate import simulate
@@ -248,62 +248,10 @@ def test_where_nearly_all_sites_couple_a_product_of_matrices_gives_the_same_deri
     one = Stretches(dynamics, np.array([0.0, 0.1]), np.array([0.1, 0.2]))
     arguments = draw.normal(size=len(texts)), draw.normal(size=(2, dynamics.size)), np.array([1, 2])
     found = one.vary(*arguments)
-    monkeypatch.setattr(sensitivity, "WIDE", np.inf)
+    monkeypatch.setattr(variational, "WIDE", np.inf)
     by_windows = one.vary(*arguments)
     np.testing.assert_allclose(found.by_state, by_windows.by_state, atol=1e-12)
     np.testing.assert_allclose(found.by_coefficient, by_windows.by_coefficient, atol=1e-12)
-
-
-# Dry friction ---------------------------------------------------------------------------------------------------------
-
-
-def sliding(u, time, stiffness=64.0, friction=0.15):
-    """Position and velocity of an oscillator with dry friction, released at u, half swing by half swing."""
-    omega = np.sqrt(stiffness)
-    rest = friction / stiffness
-    while time > np.pi / omega and abs(u) > rest:
-        u = -(u - 2 * rest * np.sign(u))
-        time -= np.pi / omega
-    if abs(u) <= rest:
-        return np.array([u, 0.0])
-    middle = rest * np.sign(u)
-    return np.array([middle + (u - middle) * np.cos(omega * time), -(u - middle) * omega * np.sin(omega * time)])
-
-
-def followed(start, time, step, substeps=1):
-    dynamics = Dynamics((Term("u[n]"), Term("sign(v[n])")), 2, False, 1, "free")
-    y = np.array([start])
-    for begin in np.arange(round(time / step)) * step:
-        stretch = Stretches(dynamics, np.array([begin]), np.array([begin + step]))
-        y = stretch.run(np.array([-64.0, -0.15]), y, np.array([substeps]))
-    return y[0]
-
-
-def test_an_oscillator_with_dry_friction_turns_round_where_the_exact_motion_does():
-    for time in (0.3, 1.0, 2.0):
-        left = followed([0.06, 0.0], time, 0.004) - sliding(0.06, time)
-        np.testing.assert_allclose(left / [1, 8], 0, atol=1e-4)
-
-
-def test_it_comes_to_rest_and_hardly_creeps():
-    assert sliding(0.01, 3.0)[1] == 0
-    np.testing.assert_allclose(followed([0.01, 0.0], 3.0, 0.004, 4), sliding(0.01, 3.0), atol=1e-4)
-
-
-def test_shorter_steps_bring_dry_friction_nearer_to_the_jump():
-    wrong = [
-        np.linalg.norm((followed([0.06, 0.0], 1.92, 0.016, substeps) - sliding(0.06, 1.92)) / [1, 8])
-        for substeps in (1, 4, 16)
-    ]
-    assert wrong[2] < wrong[1] / 2 < wrong[0] / 4
-
-
-def test_a_site_at_rest_forgets_how_fast_it_came_and_keeps_where_it_is():
-    dynamics = Dynamics((Term("u[n]"), Term("sign(v[n])")), 2, False, 1, "free")
-    stretch = Stretches(dynamics, np.array([0.0]), np.array([0.02]))
-    by_state = stretch.vary(np.array([-64.0, -0.15]), np.array([[0.001, 0.0]]), np.array([4])).by_state[0]
-    assert by_state[0, 0] == pytest.approx(1, abs=0.02)
-    assert np.max(np.abs(by_state[1])) < 0.02
 
 
 def test_stretches_of_one_equation_join_unless_something_acts_from_outside():
