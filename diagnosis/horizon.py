@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 CLOSURES, CLOSED, LOST = 6, 1.0, 1e6
 # Steps with derivatives from nearby must be so many times smaller: they do not square what is left.
 CHORD = 0.1
-# Steps of the integrator per typical interval, at most: friction that jumps would have as many as it is given.
+# Steps of the integrator per typical interval, at most: a motion that runs away would have as many as it is given.
 # In a gap, which lasts as long as several, it is at least so many for each of them.
 MOST_SUBSTEPS, MOST_IN_GAPS = 8, 2
-# Looking ahead over a step with dry friction takes as long as so many stages.
+# Looking ahead over a step with dry friction takes about as long as so many stages.
 AHEAD = 3
 # Numbers of the states of all intervals below which the time goes into calls, not into numbers.
 SMALL_BATCH = 5000

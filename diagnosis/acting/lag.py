@@ -12,6 +12,7 @@ from latticebench.diagnosis.acting.late import Late
 from latticebench.diagnosis.acting.placed import DIGITS, OfSensors, Placed
 from latticebench.diagnosis.acting.scene import Chain, Scene
 from latticebench.systems.effects import Effect
+from latticebench.systems.terms import Term
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -38,12 +39,12 @@ class Lag(OfSensors, Late, acts="lag"):
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return each sensor of several; of more than two also all but the first, and all in turn.
 
-        Beside an input also all alike. Sensors of sites without an equation are taken to be on time.
+        Beside an input that is declared also all alike. Sensors of sites without an equation are taken to be on time.
         """
         chain = scene.chain
         if not effect.texts(chain.order, chain.is_complex):
             return
-        if scene.inputs:
+        if scene.inputs and chain.sites == len(chain.moving) and any("f" in Term(text).names for text in scene.texts):
             yield cls(effect=effect, sites=chain.moving, strength=(0.0,), omega=scene.main, pattern="alike")
         if chain.sites < 2:
             return

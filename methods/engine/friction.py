@@ -11,7 +11,8 @@ and friction is as large as these (as in Moreau's time stepping, Nonsmooth Mecha
 A fit that is far from the motion needs forces without jumps: tanh(v / rest) may stand for sign(v), and is averaged
 along the same parabola.
 
-Where a site turns moves with the motion, by minus the change of v there over its slope; so do both averages.
+Where a site turns moves with the motion, by minus the change of v there over its slope. With that, and with the forces
+that hold it if it stays, both averages move. All this is for steps forward in time.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Course:
         return np.asarray(self.early + 2 * x * (self.middle - self.early))
 
     def turning(self) -> Float[ndarray, "batch moving"]:
-        """Return where v first passes through zero; 1 where it does not."""
+        """Return where v first passes through zero, 0 where it begins there; 1 where it does not."""
         bend = self.middle - self.early
         with np.errstate(all="ignore"):
             # The formula without cancellation (Press et al., Numerical Recipes (2007), section 5.6).
@@ -88,9 +89,13 @@ class Sliding:
             after = np.where(pull < 0, np.clip(-force / pull, -1.0, 1.0), np.sign(force))
             sticks = turns & (pull < 0) & (np.abs(after) < 1)
             slope = course.slope(turn)
-            by_speed = np.where(sticks, -1 / pull, (after - before) / np.where(np.abs(slope) > TINY, slope, np.inf))
+            slope = np.where(np.abs(slope) > TINY, slope, np.inf)
+            by_speed = np.where(sticks, -1 / pull, (after - before) / slope)
             by_force = np.where(sticks, -1 / pull, 0.0)
-        by_speed = np.where(turns, by_speed, 0.0)
+            # The later a site comes to rest, the later are the forces that hold it.
+            later = np.where(sticks, 6 * left**2 * (course.middle - course.early) / (pull * slope), 0.0)
+        # A site that begins at rest and slides off turns nowhere else if it is a little faster that way.
+        by_speed = np.where(turns & (sticks | (course.v != 0)), by_speed, 0.0)
         mean = before * turn + after * left
         trend = 6 * turn * left * (after - before)
         by = _along(turn[None], by_speed[None])
@@ -99,6 +104,7 @@ class Sliding:
             by[row, 1] -= turn * held
             by[row, 2] += (1 + turn) * held
             by[row, 3] += (after - before) * held
+        by[1, :3] += later * np.stack([np.ones_like(turn), turn - turn**2, turn**2])
         return cls(mean, trend, by)
 
     @classmethod

@@ -1,16 +1,12 @@
 """How a motion depends on where it starts and on its coefficients: variational equations along a chain.
 
-The state y of a lattice (see `latticebench.methods.engine.dynamics`) obeys dy/dt = F(t, y; xi), where F is linear in
-the coefficients xi. The derivatives of the end of a stretch of motion by its start and by the coefficients follow from
-
-    d/dt (dy/dy0) = (dF/dy) (dy/dy0),   d/dt (dy/dxi_j) = (dF/dy) (dy/dxi_j) + dF/dxi_j
-
-(Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, section I.14). The integrator is the Runge-Kutta
-method of order 8 of Dormand and Prince (the same book, section II.5), with steps of equal length inside a stretch.
+The state y of a lattice (see `latticebench.methods.engine.dynamics`) and its derivatives (see
+`latticebench.methods.engine.variational`) are integrated by a Runge-Kutta method of Dormand and Prince (Hairer, Norsett
+& Wanner, Solving Ordinary Differential Equations I, section II.5), with steps of equal length inside a stretch.
 
 All stretches between sample times are integrated side by side. In a short stretch a site is influenced by near
-neighbours only. Sites far apart are then disturbed together and their effects are separated afterwards (Curtis, Powell
-& Reid, IMA J. Appl. Math. 13, 117 (1974)), so that the cost per site does not grow with the length of the chain.
+neighbours only. Sites far apart are then disturbed together and their effects are separated afterwards (see
+`latticebench.methods.engine.colouring`), so that the cost per site does not grow with the length of the chain.
 """
 
 from __future__ import annotations

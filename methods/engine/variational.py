@@ -4,12 +4,13 @@ The derivatives z of the states y, one row for each number that is varied, follo
 
     dz/dt = (dF/dy) z + dF/dxi
 
-(Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, section I.14). The batch is the last axis of z, so
-that the innermost loops are long even on short chains.
+where dy/dt = F(t, y; xi) is linear in the coefficients xi (Hairer, Norsett & Wanner, Solving Ordinary Differential
+Equations I, section I.14). The batch is the last axis of z, so that the innermost loops are long even on short chains.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -51,14 +52,14 @@ class Rubbed:
 
     Attributes:
         line: what stands for sign(v).
-        changes: derivatives of the force by the line's mean and its trend, or None.
+        changes: derivatives of its mean and its trend by what is varied, or None.
     """
 
     line: Sliding
     changes: Float[ndarray, "2 columns moving batch"] | None
 
     def at(self, x: float) -> tuple[ndarray, ndarray | None]:
-        """Return the line at a share of the step, and what it adds to the derivatives of the force."""
+        """Return the line at a share of the step, and its derivatives."""
         changes = None if self.changes is None else self.changes[0] + (x - 0.5) * self.changes[1]
         return self.line.at(x), changes
 
@@ -101,7 +102,7 @@ class Rates:
     ) -> Float[ndarray, "batch state"]:
         """Return dy/dt, and write dz/dt into `out` if there is a z.
 
-        Dry friction acts along `sliding`, see `Dynamics.linear`; `changes` are the derivatives of its force by that.
+        Dry friction acts along `sliding`, see `Dynamics.linear`, of which `changes` are the derivatives.
         """
         dynamics = self.dynamics
         rate, values, slopes = dynamics.linear(
@@ -110,7 +111,7 @@ class Rates:
         if z is not None and out is not None:
             self._vary(out, z, values, slopes, outside)
             if changes is not None:
-                out[:, dynamics.count : dynamics.read] += changes
+                out[:, dynamics.count : dynamics.read] += self._pull(outside.t).T * changes
             if dynamics.resonators:
                 self._vary_unread(out, z, y, np.tensordot(self.coefficients, values[0], 1))
         return rate
@@ -119,30 +120,49 @@ class Rates:
         """Look ahead over a step of length h, from its beginning to its middle, before any site turns."""
         dynamics = self.dynamics
         rest, moving = dynamics.rest, slice(dynamics.count, dynamics.read)
-        sizes = dynamics.rubbing_sizes(middle.t)
-        pull = np.tensordot(self.coefficients[dynamics.rubbing], sizes, 1)
+        pull = h[:, None] * self._yielding * self._pull(middle.t)
 
         def ahead(outside: Outside, y_there: ndarray, z_there: Any) -> tuple[ndarray, Any]:
             sliding = np.tanh(y_there[:, moving] / rest) if rest else np.sign(y[:, moving])
             if z_there is None:
                 return self.at(outside, y_there, None, None, sliding), None
             out = np.empty(z_there.shape)
-            changes = (pull * (1 - sliding**2) / rest).T * z_there[:, moving] if rest else None
+            changes = ((1 - sliding**2) / rest).T * z_there[:, moving] if rest else None
             return self.at(outside, y_there, z_there, out, sliding, changes), out
 
         rate, varied = ahead(first, y, z)
-        later, beyond = ahead(middle, y + h[:, None] / 2 * rate, None if z is None else z + h / 2 * varied)
-        course = Course(y[:, moving], h[:, None] * rate[:, moving], h[:, None] * later[:, moving])
-        line = Sliding.soft(course, rest) if rest else Sliding.abrupt(course, h[:, None] * pull)
+        halfway, later = y + h[:, None] / 2 * rate, None if z is None else z + h / 2 * varied
+        if not rest:
+            held = (y[:, moving] * halfway[:, moving] <= 0) & (
+                np.abs(h[:, None] * rate[:, moving] - pull * np.sign(y[:, moving])) < -pull
+            )
+            halfway[:, moving][held] = 0.0
+            if later is not None:
+                later[:, moving] *= ~held.T
+        onwards, beyond = ahead(middle, halfway, later)
+        course = Course(y[:, moving], h[:, None] * rate[:, moving], h[:, None] * onwards[:, moving])
+        line = Sliding.soft(course, rest) if rest else Sliding.abrupt(course, pull)
         if z is None:
             return Rubbed(line, None)
-        by_v, by_early, by_middle, by_pull = np.moveaxis(np.swapaxes(line.by * pull, 2, 3)[:, :, None], 1, 0)
+        by_v, by_early, by_middle, by_pull = np.moveaxis(np.swapaxes(line.by, 2, 3)[:, :, None], 1, 0)
         changes = by_v * z[:, moving] + h * (by_early * varied[:, moving] + by_middle * beyond[:, moving])
         if self.by_terms:
             own = self._first(len(z))
-            for number, size in zip(dynamics.rubbing, sizes, strict=True):
-                changes[:, own + number] += by_pull[:, 0] * h * size.T
+            for number, size in zip(dynamics.rubbing, dynamics.rubbing_sizes(middle.t), strict=True):
+                changes[:, own + number] += by_pull[:, 0] * h * (self._yielding * size).T
         return Rubbed(line, changes)
+
+    def _pull(self, t: Float[ndarray, " batch"]) -> Float[ndarray, "batch moving"]:
+        """Return the coefficient of sign(v)."""
+        return np.asarray(np.tensordot(self.coefficients[self.dynamics.rubbing], self.dynamics.rubbing_sizes(t), 1))
+
+    @functools.cached_property
+    def _yielding(self) -> Float[ndarray, " moving"]:
+        """By how much more a force changes the speed of a site if what carries the site gives way."""
+        found = np.ones(self.dynamics.count)
+        for one in self.dynamics.resonators:
+            found[list(one.sites)] += one.slopes[1, -1]
+        return found
 
     def _first(self, columns: int) -> int:
         """Return the first column of the coefficients."""
