@@ -180,6 +180,11 @@ def test_the_page_on_the_diagnosis_says_how_often_what_hangs_or_rubs_and_what_is
     assert f"Friction at one site was named in {share(held['local-friction'])}, a mass" in words("diagnosis")
     assert f"a mass beside one in {share(held['side-mass'])}, a support in" in words("diagnosis")
     assert f"a support in {share(held['swaying-support'])}: forces" in words("diagnosis")
+    again = RESULTS / "loop" / "supports"
+    supports = pd.read_csv(again / "summary.csv", comment="#", dtype=str).iloc[0]
+    named = pd.read_csv(again / "effects.csv", comment="#", dtype=str).set_index("effect")["named"]
+    assert f"and no other in {share(supports['right'])}, and the support in" in words("diagnosis")
+    assert f"the support in {share(named['swaying-support'])}." in words("diagnosis")
     assert f"`results/loop/ranges`): {share(ranges['right'])}, and intervals" in words("diagnosis")
     assert f"the true size in {share(ranges['intervals that hold'])}. Of other" in words("diagnosis")
 
