@@ -25,8 +25,8 @@ class Lag(OfSensors, Late, acts="lag"):
 
     Filters, converters that scan their channels and cameras that are not in step do this. A filter of first order
     also reads less, by the root of 1 + omega^2 tau^2 at an angular frequency omega: a gain, where the motion has about
-    one frequency. What all sensors lag by is no more than another zero of the time, but where an input was measured:
-    then they lag behind that, or are ahead of it.
+    one frequency. A lag of all sensors is only another zero of the time, unless an input was measured: then they lag
+    behind that, or are ahead of it.
 
     Attributes:
         pattern: whether each site has a lag of its own, each lags behind the one before by the same, or all lag alike.
@@ -39,7 +39,7 @@ class Lag(OfSensors, Late, acts="lag"):
     def places(cls, effect: Effect, scene: Scene) -> Iterator[Placed]:
         """Return each sensor of several; of more than two also all but the first, and all in turn.
 
-        Beside an input that is declared also all alike. Sensors of sites without an equation are taken to be on time.
+        Where an input is declared, also all alike. Sensors of sites without an equation are taken to be on time.
         """
         chain = scene.chain
         if not effect.texts(chain.order, chain.is_complex):

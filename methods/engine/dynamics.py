@@ -284,17 +284,17 @@ class Dynamics:
 
     def rubbing_sizes(self, t: Float[ndarray, " batch"]) -> Float[ndarray, "rubbing batch moving"]:
         """Return weight times factor of each term that is dry friction."""
-        found, factors = np.ones((len(self.rubbing), len(t), self.count)), self._factors(t)
+        found, factors = np.ones((len(self.rubbing), len(t), self.count)), self._factors(t, self.rubbing)
         for size, term in zip(found, self.rubbing, strict=True):
             size *= 1.0 if self.weights is None else self.weights[term, self.moving]
             size *= factors[term][0] if term in factors else 1.0
         return found
 
-    def _factors(self, t: ndarray) -> dict[int, ndarray]:
-        """Evaluate the factors at the sites that have an equation; each is (parts, B, M)."""
+    def _factors(self, t: ndarray, terms: Sequence[int] | None = None) -> dict[int, ndarray]:
+        """Evaluate the factors, of all terms or of some, at the sites that have an equation; each is (parts, B, M)."""
         found = {}
         for term, factor in enumerate(self.factors or ()):
-            if factor is not None:
+            if factor is not None and (terms is None or term in terms):
                 whole = np.broadcast_to(factor(t), (self.parts, len(t), self.sites))
                 found[term] = whole[..., self.moving]
         return found

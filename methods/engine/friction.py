@@ -11,8 +11,8 @@ and friction is as large as these (as in Moreau's time stepping, Nonsmooth Mecha
 A fit that is far from the motion needs forces without jumps: tanh(v / rest) may stand for sign(v), and is averaged
 along the same parabola.
 
-Where a site turns moves with the motion, by minus the change of v there over its slope. With that, and with the forces
-that hold it if it stays, both averages move. All this is for steps forward in time.
+The place of a turn depends on the motion: it moves by minus the change of v there over the slope of v. Both averages
+depend on that place, and on the forces that hold a site which stays. All this is for steps forward in time.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Sliding:
             by_force = np.where(sticks, -1 / pull, 0.0)
             # The later a site comes to rest, the later are the forces that hold it.
             later = np.where(sticks, 6 * left**2 * (course.middle - course.early) / (pull * slope), 0.0)
-        # A site that begins at rest and slides off turns nowhere else if it is a little faster that way.
+        # A site that slides off from rest does so as the step begins, even if it moves a little that way already.
         by_speed = np.where(turns & (sticks | (course.v != 0)), by_speed, 0.0)
         mean = before * turn + after * left
         trend = 6 * turn * left * (after - before)
